@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,7 +16,7 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye.methods.closed_form import Bounds
-    from stcal.workflows.handeye_inputs import Files, Timing
+    from stcal.workflows.handeye_inputs import Files
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,18 +63,17 @@ class PoseFiles:
     quaternions: shared.Quaternions = "wxyz"
     workers: shared.Workers = None
 
-    def given(self, timing: "Timing") -> "Files":
-        """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
+    def given(self, **timing: Any) -> "Files":
+        """Returns the file or folder given as argument, or --a and --b, of any of the formats."""
         from stcal.handeye.data.pose_content import Said
-        from stcal.workflows.handeye_inputs import Files, one_source
+        from stcal.workflows.handeye_inputs import Files
 
         said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
-        if self.source is None and self.first is not None and self.second is not None:
-            source, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing)
-            print_each("note", notes)
-        else:
-            source = shared.JoinOptions(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
-        return Files(source, self.poses, self.camera, self.board, said, self.quaternions, timing)
+        source, second = self.first, self.second
+        if self.source is not None or source is None or second is None:
+            source, second = shared.JoinOptions(source, second, self.key).table(self.source, "POSES|IMAGES"), None
+        own = self.poses, self.camera, self.board
+        return Files(source, *own, second, self.key, said, self.quaternions, **timing)
 
 
 POSE_FILES = PoseFiles()
@@ -159,14 +158,13 @@ def handeye(
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.static_transforms import messages
-    from stcal.workflows.handeye_inputs import Timing
     from stcal.workflows.handeye_run import ALL, calibrate_handeye, without_flips
 
     turns = (None if each is None else math.radians(each) for each in (sigma_robot_deg, sigma_camera_deg))
     noise = Noise(next(turns), sigma_robot_mm, next(turns), sigma_camera_mm, sigma_px, sigma_board_mm)
-    timing = Timing(time_tolerance, image_times, time_offset)
     exports = shared.exports_of(export or [], forms.FORMS)
-    given, folder = files.given(timing), files.source is not None and files.source.is_dir()
+    given = files.given(tolerance_s=time_tolerance, image_times=image_times, time_offset=time_offset)
+    folder = files.source is not None and files.source.is_dir()
     for code, refusals in {
         "E-OPTION-NEEDS": {
             "--camera-out: only with --refine-camera; otherwise the camera stays as given": (
@@ -207,6 +205,7 @@ def handeye(
         return
     with StageProgress() as progress:
         inputs = given.read(files.workers, progress)
+        print_each("note", inputs.notes)
         for line in inputs.understood:
             say(line)
         prior = inputs.prior if refine_camera else None
@@ -282,13 +281,12 @@ def plan(
     from stcal.handeye.plan import HandEyePlanFile, planned_csv, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
-    from stcal.workflows.handeye_inputs import Timing
     from stcal.workflows.handeye_run import plan_handeye
 
     robot = load_robot(robot_file) if robot_file else None
-    given = files.given(Timing())
     with StageProgress() as progress:
-        inputs = given.read(files.workers, progress)
+        inputs = files.given().read(files.workers, progress)
+    print_each("note", inputs.notes)
     for line in inputs.understood:
         say(line)
     planned = plan_handeye(inputs, count, robot, seed)

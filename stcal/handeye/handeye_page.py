@@ -317,9 +317,8 @@ def image_coverage(views: Views) -> np.ndarray:
 
 def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
     """Returns the corners (k, 2) px of each view by the robot's reported pose, NaN behind the camera."""
-    camera, adjusted = as_adjusted(result, views)
-    poses = poses_by_robot(result, Loop.of(pairs, result.setup))
-    return [camera.project(pose @ view.xyz_board) for view, pose in zip(adjusted, poses, strict=True)]
+    adjusted, poses = as_adjusted(result, views), poses_by_robot(result, Loop.of(pairs, result.setup))
+    return [adjusted.camera.project(pose @ v.xyz_board) for v, pose in zip(adjusted.views, poses, strict=True)]
 
 
 def pose_bars(result: HandEye) -> Drawing:

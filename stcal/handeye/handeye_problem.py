@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
-from typing import Any, TypeVar
 
 import numpy as np
 from scipy.special import chdtri
@@ -14,20 +13,19 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import remarks
 from stcal.handeye.conventions import check_conventions, flipped, repair
-from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.corner_views import Views, resect
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
-from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, PoseSolution, adjust_poses, by_places, places
+from stcal.handeye.methods.pose_adjustment import UNKNOWNS, Noise, PoseSolution, adjust_poses, places
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
     ROBOT,
     AdjustedCorners,
+    Bundle,
     Reprojection,
     adjust_views,
     of_poses,
-    resected,
-    slope,
 )
 from stcal.handeye.remarks import Aside, Observability, Remarks, Verdict, check, in_words, require_scale
 from stcal.io.cameras.camera_model import CameraPrior
@@ -137,7 +135,7 @@ class HandEye(Brief):
         return rms_of(self.residuals[~self.outliers])
 
 
-S = TypeVar("S", PoseSolution, AdjustedCorners)
+Adjusted = PoseSolution | AdjustedCorners
 SCALED = ("pose", "reprojection")  # methods that weigh errors, and can find the board's size
 METHODS = (*AX_XB, *AX_ZB, "zhao", "de", "de-polished", *SCALED)
 """Names of all methods."""
@@ -269,31 +267,9 @@ class HandEyeProblem:
             problem = replace(problem, notes=(*problem.notes, *doubts))
         if method not in SCALED:
             x, z, notes = problem._by_equations(method)
-            return problem._solved(method, x, z, problem.loop.residuals(x, z), notes)
-        first, views = guess(problem.loop, options.with_scale), problem.views
-        return problem._by_poses(first) if views is None or method == "pose" else problem._by_views(first, views)
-
-    def _solved(
-        self,
-        method: str,
-        x: Rigid,
-        z: Rigid,
-        residuals: np.ndarray,
-        notes: tuple[str, ...],
-        covariance: np.ndarray | None = None,
-        solution: PoseSolution | AdjustedCorners | None = None,
-        **more: Any,
-    ) -> "Solved":
-        """Returns X and Z as a result, with their ``covariance`` (12, 12) or more; ``more`` : further fields of it."""
-        names = self.pairs.names
-        outliers = np.zeros(len(names), bool)
-        if solution is not None:
-            outliers, notes = solution.outliers, notes if solution.settled else (*notes, UNSETTLED)
-            more["scale"] = solution.state.scale
-        if covariance is not None:
-            more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
-        more |= {"observability": self.seen, "notes": notes}
-        return Solved(self, HandEye(method, self.setup, x, z, residuals, names, outliers, **more), solution)
+            of_loop = problem.loop.residuals(x, z), problem.pairs.names, np.zeros(len(problem), bool)
+            return Solved(problem, HandEye(method, self.setup, x, z, *of_loop, observability=seen, notes=notes))
+        return problem._adjusted(method, guess(problem.loop, options.with_scale))
 
     def _by_equations(self, method: str) -> tuple[Rigid, Rigid, Remarks]:
         """Returns X and Z, by AX = XB or AX = ZB and the named method, and notes."""
@@ -329,21 +305,60 @@ class HandEyeProblem:
             z = closed_form.mean_pose(loop.chain(x))
         return x, z, notes
 
-    def _by_poses(self, first: LoopState) -> "Solved":
-        """Solves by least squares of the poses' errors, from ``first`` X, Z and scale."""
-        options, loop, scaled = self.options, self.loop, self.options.with_scale
-        solution, noise, notes = self._by_true_robot(lambda loop, noise: adjust_poses(loop, first, noise, scaled))
-        state, x, z = solution.state, solution.state.mount_from_camera, solution.state.stand_from_board
-        notes, covariance, common = self.notes + notes, generalised_inverse(solution.normal), None
-        if not options.four_dof and (clusters := by_places(loop, solution)):
-            covariance, notes = clusters.covariance, (*notes, AT_ONE_PLACE)
-        sigma_scale = float(np.sqrt(covariance[12, 12])) if scaled else None
-        if sigma_scale is not None:
-            require_scale(state.scale, sigma_scale, loop, self.pairs.where)
+    def _adjusted(self, method: str, first: LoopState) -> "Solved":
+        """Solves by least squares of the poses' errors, or of the corners of the views, from ``first`` X, Z, scale."""
+        options, views = self.options, self.views if method == "reprojection" else None
+
+        def solved(loop: Loop, noise: Noise) -> Adjusted:
+            if views is None:
+                return adjust_poses(loop, first, noise, options.with_scale)
+            return adjust_views(loop, views, first, noise, options.intrinsics, options.with_scale)
+
+        solution, noise, of_robot = self._by_true_robot(solved)
+        state, outliers, count, notes = solution.state, solution.outliers, len(solution.normal), self.notes + of_robot
+        x, z, covariance = state.mount_from_camera, state.stand_from_board, solution.inverse[:count, :count]
+        sigma_scale = float(np.sqrt(solution.inverse[UNKNOWNS, UNKNOWNS])) if options.with_scale else None
+        board = common = by_poses = None
         if options.four_dof:
             x, z, covariance, notes = self._without_slide(x, z, solution.normal)
-        inverse = covariance
-        notes += self._remarks(x, solution.outliers, solution.residuals, solution.scale_hint(loop))
+        if isinstance(solution, PoseSolution):
+            by_poses, residuals = solution, solution.residuals
+        else:
+            if options.intrinsics is None and options.camera is not None:
+                covariance = solution.considering(options.camera, covariance)
+            board = solution.found
+            seen, _ = resect(board.adjusted(solution.views), self.pairs.names)
+            loop = replace(solution.loop, camera_from_board=seen)
+            residuals, good = loop.residuals(x, z), loop[~outliers]
+            if places(good) is not None:
+                by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)
+        if by_poses is not None and not options.four_dof and (clusters := by_poses.by_places()):
+            # What the places add to the covariance of the board's poses, they add to that of the corners.
+            added = clusters.covariance - clusters.independent
+            covariance, notes = covariance + added[:count, :count], (*notes, AT_ONE_PLACE)
+            if sigma_scale is not None:
+                sigma_scale = float(np.sqrt(sigma_scale**2 + added[UNKNOWNS, UNKNOWNS]))
+        if sigma_scale is not None:
+            require_scale(state.scale, sigma_scale, self.loop, self.pairs.where)
+        notes += self._remarks(x, outliers, residuals, solution.scale_hint)
+        sigma, estimated = solution.sigma, solution.estimated
+        if isinstance(solution, PoseSolution):
+            stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
+            sigma = {name: value for name, value in stated.items() if value} | sigma
+            covariance, common, doubts = self._of_poses(solution, noise, covariance)
+        else:
+            doubts = self._of_camera(solution)
+        notes += doubts if solution.settled else (*doubts, UNSETTLED)
+        told = residuals, self.pairs.names, outliers, covariance[:6, :6], covariance[6:12, 6:12]
+        more = state.scale, sigma_scale, sigma, estimated, board, self.seen, notes, common
+        return Solved(self, HandEye(method, self.setup, x, z, *told, *more), solution)
+
+    def _of_poses(
+        self, solution: PoseSolution, noise: Noise, inverse: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, Remarks]:
+        """Returns the covariance with what residuals, common errors, and the camera add to the ``inverse`` normal
+        matrix, (k, k); the part of X from common errors; and notes."""
+        loop, covariance, common, notes = self.loop, inverse, None, ()
         if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
             notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
         if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -354,53 +369,25 @@ class HandEyeProblem:
                 notes += (f"{times}; correct σ, or look for errors",)
                 covariance = covariance * max(factor, 1)
         if loop.camera_common is not None:
-            moved = inverse @ slope(loop, solution, loop.camera_common)
+            moved = inverse @ solution.slope(loop.camera_common)
             added = moved @ moved.T
             common, notes, covariance = added[:6, :6], (*notes, IN_COMMON), covariance + added
-        if self.views is not None and options.camera is not None:
-            covariance = covariance + of_poses(loop, solution, self.views, options.camera, inverse)
-        stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-        sigma = {name: value for name, value in stated.items() if value} | solution.sigma
-        more: dict[str, Any] = {"sigma_scale": sigma_scale, "sigma": sigma, "estimated": tuple(solution.sigma)}
-        more |= {"covariance": covariance, "common_covariance": common, "solution": solution}
-        return self._solved("pose", x, z, solution.residuals, notes, **more)
+        if self.views is not None and self.options.camera is not None:
+            covariance = covariance + of_poses(solution, self.views, self.options.camera, inverse)
+        return covariance, common, notes
 
-    def _by_views(self, first: LoopState, views: Views) -> "Solved":
-        """Solves by least squares of the corners of the ``views``, from ``first`` X, Z and scale."""
-        options, pairs = self.options, self.pairs
-        unknowns = options.intrinsics, options.with_scale
-        solution, _, notes = self._by_true_robot(lambda loop, noise: adjust_views(loop, views, first, noise, *unknowns))
-        state, outliers, sigma_scale = solution.state, solution.outliers, solution.sigma_scale
-        if sigma_scale is not None:
-            require_scale(state.scale, sigma_scale, self.loop, pairs.where)
-        x, z = state.mount_from_camera, state.stand_from_board
-        notes, covariance = self.notes + notes, solution.inverse[:UNKNOWNS, :UNKNOWNS]
-        if options.four_dof:
-            x, z, covariance, notes = self._without_slide(x, z, solution.normal())
-        if options.intrinsics is None and options.camera is not None:
-            covariance = solution.considering(options.camera, covariance)
-        closed = replace(solution.loop, camera_from_board=resected(pairs.names, views, solution.found))
-        residuals, good = closed.residuals(x, z), closed[~outliers]
-        if not options.four_dof and places(good) is not None:
-            # What the places add to the covariance of the board's poses, they add to that of the corners.
-            by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)
-            if clusters := by_places(good, by_poses):
-                added = clusters.covariance - clusters.independent
-                covariance, notes = covariance + added[:12, :12], (*notes, AT_ONE_PLACE)
-                if sigma_scale is not None:
-                    sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
-        notes += self._remarks(x, outliers, residuals, solution.scale_hint)
-        if options.intrinsics is None and solution.camera_gain() > CAMERA_GAIN:
+    def _of_camera(self, solution: AdjustedCorners) -> Remarks:
+        """Returns notes on a camera file that the corners contradict."""
+        notes: Remarks = ()
+        if self.options.intrinsics is None and solution.camera_gain() > CAMERA_GAIN:
             notes += ("the camera file does not fit the corners: solve for the intrinsics too, or calibrate it again",)
         doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
         if doubted:
             which = ", ".join(f"{FACTORS[name]} {factor:.1f} times" for name, factor in doubted.items())
             notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-        more: dict[str, Any] = {"sigma_scale": sigma_scale, "sigma": solution.sigma, "estimated": solution.estimated}
-        more |= {"covariance": covariance, "reprojection": solution.found, "solution": solution}
-        return self._solved("reprojection", x, z, residuals, notes, **more)
+        return notes
 
-    def _by_true_robot(self, solved: Callable[[Loop, Noise], S]) -> tuple[S, Noise, Remarks]:
+    def _by_true_robot(self, solved: Callable[[Loop, Noise], Adjusted]) -> tuple[Adjusted, Noise, Remarks]:
         """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
         contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
         noise, loop = self.options.noise, self.loop
@@ -465,7 +452,7 @@ class Solved:
 
     problem: HandEyeProblem
     result: HandEye
-    solution: PoseSolution | AdjustedCorners | None = None
+    solution: Adjusted | None = None
 
     def without(self, out: np.ndarray) -> HandEye:
         """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
@@ -474,11 +461,9 @@ class Solved:
         if solution is None:
             x, z, _ = problem.without(out)._by_equations(self.result.method)
             return replace(self.result, mount_from_camera=x, stand_from_board=z)
-        if isinstance(solution, AdjustedCorners):
-            state = solution.without(out)
+        state = solution.without(out)
+        if isinstance(solution, AdjustedCorners) and isinstance(state, Bundle):
             board = replace(solution.found, camera=state.camera, corners=state.scale * state.corners)
-        else:
-            state = solution.without(problem.loop, out)
         x, z = state.mount_from_camera, state.stand_from_board
         if problem.options.four_dof:
             x, z = closed_form.slid(x, z, problem.seen.mount_axis, problem.loop)

@@ -226,9 +226,9 @@ def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
     loop, x, z, scale = unseen.loop, result.mount_from_camera, result.stand_from_board, result.scale
     errors = {"mount_from_camera": x.matrix()}
     if unseen.views is not None:
-        camera, seen = as_adjusted(result, unseen.views)
-        by_view, _ = resect(Views(camera, tuple(seen)), unseen.pairs.names)
-        chains = zip(seen, poses_by_robot(result, loop), by_view, strict=True)
+        adjusted = as_adjusted(result, unseen.views)
+        by_view, _ = resect(adjusted, unseen.pairs.names)
+        chains = zip(adjusted.views, poses_by_robot(result, loop), by_view, strict=True)
         off = (first @ view.xyz_board - second @ view.xyz_board for view, first, second in chains)
         errors["board_mm"] = deciding_error(result, unseen)
         errors["pose_mm"] = np.array([np.linalg.norm(each, axis=1).mean() for each in off])
@@ -241,9 +241,9 @@ def deciding_error(result: HandEye, unseen: HandEyeProblem) -> np.ndarray:
     """Returns errors (k,), mm, that choose among solutions: ``board_mm``, or ``translation_mm`` without views."""
     if unseen.views is None:
         return errors_of(result, unseen)["translation_mm"]
-    camera, seen = as_adjusted(result, unseen.views)
-    poses = zip(seen, poses_by_robot(result, unseen.loop), strict=True)
-    return np.array([_beside(view, camera, pose) for view, pose in poses])
+    adjusted = as_adjusted(result, unseen.views)
+    poses = zip(adjusted.views, poses_by_robot(result, unseen.loop), strict=True)
+    return np.array([_beside(view, adjusted.camera, pose) for view, pose in poses])
 
 
 def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
@@ -254,12 +254,11 @@ def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
     return float(np.linalg.norm(camera_centre + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 
-def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
-    """Returns the camera of the result, and the views with the corners at their places on its board."""
-    board = result.reprojection
-    if board is None:
-        return views.camera, [view.moved(result.scale * view.xyz_board) for view in views.views]
-    return board.camera, [view.moved(board.board(view.xyz_board)) for view in views.views]
+def as_adjusted(result: HandEye, views: Views) -> Views:
+    """Returns the views by the camera of the result, with the corners at their places on its board."""
+    if result.reprojection is not None:
+        return result.reprojection.adjusted(views)
+    return replace(views, views=tuple(view.moved(result.scale * view.xyz_board) for view in views.views))
 
 
 def poses_by_robot(result: HandEye, loop: Loop) -> Poses:

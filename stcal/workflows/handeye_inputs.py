@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -36,30 +35,18 @@ from stcal.io.table import Table, read_table
 from stcal.parallel import Progress, one_thread
 from stcal.workflows.board_views import detect_boards, kind_of
 
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """``tolerance_s`` : within which the nearest sample replaces a pose that cannot be interpolated; ``image_times`` :
-    file with ``image`` and ``time_s``, where names of images are not times; ``offset`` : whether the clocks' offset is
-    estimated."""
-
-    tolerance_s: float = TOLERANCE_S
-    image_times: Path | None = None
-    offset: bool = False
-
-
 LeftOut = tuple[tuple[str, str], ...]  # names of images or rows, and why they do not take part
 Clock = tuple[Stream, dict[str, float]]  # the robot's stream, and the time of each image after its origin, by name
 
 
-def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tuple[PoseSide, LeftOut, Clock | None]:
+def robot_at_images(robot: PoseSide, names: Sequence[str], files: "Files") -> tuple[PoseSide, LeftOut, Clock | None]:
     """Returns poses at the times of images, where both have times that are not simply equal; else as they are. Raises
     InputError: an option needs times, or no image lies within the stream."""
-    images, where = _times_of_images(names, timing), f"robot poses {robot.where}"
+    images, where = _times_of_images(names, files.image_times), f"robot poses {robot.where}"
     samples = [time_of(name) for name in robot.names] if robot.timed else stamps_of(robot.names)
     known = [] if samples is None else [time for time in samples if time is not None]
     untimed = not known or len(known) < len(robot)
-    if timing.offset or timing.image_times or robot.timed:
+    if files.time_offset or files.image_times or robot.timed:
         if images is None:
             said = f"its name is not a time, but the robot's poses are matched by time ({Path(robot.where).name}); name"
             remedy = "images by seconds (1689.25.png), or give --image-times"
@@ -76,7 +63,7 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         stream = Stream.of(known, robot.poses, Path(robot.where).name)
         return stream, dict(zip(images, stream.after_origin(list(images.values())).tolist(), strict=True))
 
-    if not timing.offset and all(time in known for time in images.values()):  # rows without an image are no mistake
+    if not files.time_offset and all(time in known for time in images.values()):  # rows without an image are no mistake
         rows = [known.index(time) for time in images.values()]
         lines = f"{robot.understood}; {len(rows)} of them at the times of images"
         dense = len(images) < len(known) == len(set(known))
@@ -84,29 +71,25 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], timing: Timing) -> tu
         return robot, (), clock() if dense else None
     stream, seconds = clock()
     seen = tuple(images)
-    taken = taken_at(stream, np.array(list(seconds.values())), seen, timing.tolerance_s)
+    taken = taken_at(stream, np.array(list(seconds.values())), seen, files.tolerance_s)
     if not taken.rows:
         raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {': '.join(taken.left_out[0])}")
     kept = tuple(seen[i] for i in taken.rows)
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    read: dict[str, Any] = {
-        "names": kept,
-        "places": tuple(f"time of {name}" for name in kept),
-        "covariance": None,
-        "own": False,
-        "timed": False,
-    }
-    read |= {"poses": taken.base_from_flange, "understood": f"{robot.understood}{note}; {taken.said}"}
-    untimed_images = tuple((name, f"no time in {timing.image_times}") for name in names if name not in images)
-    return replace(robot, **read), taken.left_out + untimed_images, (stream, seconds)
+    robot = replace(
+        robot[taken.rows], poses=taken.base_from_flange, names=kept, covariance=None, own=False, timed=False
+    )
+    places, lines = tuple(f"time of {name}" for name in kept), f"{robot.understood}{note}; {taken.said}"
+    untimed_images = tuple((name, f"no time in {files.image_times}") for name in names if name not in images)
+    return replace(robot, places=places, understood=lines), taken.left_out + untimed_images, (stream, seconds)
 
 
-def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:
+def _times_of_images(names: Sequence[str], stated_in: Path | None) -> dict[str, Decimal] | None:
     """Returns times by image, as the file of times states them, or as the names state them."""
-    if timing.image_times is None:
+    if stated_in is None:
         times = stamps_of(names)
         return None if times is None else dict(zip(names, times, strict=True))
-    table = read_table(timing.image_times, "image times")
+    table = read_table(stated_in, "image times")
     stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
     if len(stated) < len(table):
         raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")
@@ -126,21 +109,6 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
 
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | HandEyeInput
-
-
-def one_source(
-    first: Path, second: Path, key: str, statements: Said, quaternions: Order = "wxyz", timing: Timing | None = None
-) -> tuple[Source, tuple[str, ...]]:
-    """Returns the poses of two files, the robot's and the camera's, as one source, and notes on rows left out. Two
-    tables of the package's own are joined as tables."""
-    timing = timing or Timing()
-    if told := read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset):
-        return told, ()
-    for path in (first, second):
-        require_own(path, quaternions)
-    require_unsaid(statements, f"{first}, {second}")
-    joined = join_tables(str(first), str(second), key, PREFIXES, quaternions)
-    return joined.table, joined.notes
 
 
 @require_arguments
@@ -194,51 +162,72 @@ def read_handeye(
     Raises InputError: A file is missing or not of the required form, one file too many was given, or no image shows the
     board.
     """
-    statements = Said.of_options(rotation, length_unit, poses_are, setup)
     paths = (None if path is None else Path(path) for path in (poses, camera, board, second, image_times))
-    robot_file, camera_file, board_file, other, times = paths
-    timing, notes = Timing(tolerance_s, times, time_offset), ()
+    robot, lens, design, other, times = paths
     place = Path(source) if isinstance(source, str) else source
-    if isinstance(place, Path) and other is not None and not place.is_dir():
-        place, notes = one_source(place, other, key, statements, quaternions, timing)
-    files = Files(place, robot_file, camera_file, board_file, statements, quaternions, timing)
-    return replace(files.read(workers, progress), notes=notes)
+    statements = Said.of_options(rotation, length_unit, poses_are, setup)
+    timing = tolerance_s, times, time_offset
+    files = Files(place, robot, lens, design, other, key, statements, quaternions, *timing)
+    return files.read(workers, progress)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Files:
     """Files of poses, or a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``statements`` : the user's statements about what files do not state; the others as of :func:`read_handeye`.
+    ``second`` : the camera's poses, where the source has the robot's; ``statements`` : the user's statements about what
+    files do not state; the others as of :func:`read_handeye`.
     """
 
     source: Source
     poses: Path | None = None
     camera: Path | None = None
     board: Path | None = None
+    second: Path | None = None
+    key: str = "image"
     statements: Said = field(default_factory=Said)
     quaternions: Order = "wxyz"
-    timing: Timing = field(default_factory=Timing)
+    tolerance_s: float = TOLERANCE_S
+    image_times: Path | None = None
+    time_offset: bool = False
 
     @one_thread()
     def read(self, workers: int | None = None, progress: Progress | None = None) -> HandEyeInput:
         """Returns the pairs of poses, and the views of the board if there are images."""
         if isinstance(self.source, Path) and self.source.is_dir():
             return _Photographs(self, self.source).pairs(workers, progress or (lambda *_: None))
-        self._require_no_images()
-        source, stated = self.source, self.statements.setup
+        return self._pairs(*self._joined())
+
+    def _joined(self) -> tuple[Source, tuple[str, ...]]:
+        """Returns the poses of both files as one source, and notes on rows left out. Two tables of the package's own
+        are joined as tables."""
+        first, second = self.source, self.second
+        if second is None or not isinstance(first, Path):
+            return first, ()
+        if told := read_two(
+            first, second, self.statements, self.key, self.quaternions, self.tolerance_s, self.time_offset
+        ):
+            return told, ()
+        for path in (first, second):
+            require_own(path, self.quaternions)
+        require_unsaid(self.statements, f"{first}, {second}")
+        joined = join_tables(str(first), str(second), self.key, PREFIXES, self.quaternions)
+        return joined.table, joined.notes
+
+    def _pairs(self, source: Source, notes: tuple[str, ...]) -> HandEyeInput:
+        self._require_no_images(source)
+        stated = self.statements.setup
         told = source if isinstance(source, HandEyeInput) else read_pairs(source, self.statements, self.quaternions)
         where = source.name if isinstance(source, Path) else told.where
         if stated and told.setup and stated != told.setup:
             raise InputError("E-OPTION-CONTRADICTS", f"{where}: of {told.setup}, --setup {stated}; leave it out")
-        return replace(told, where=where, setup=stated or told.setup)
+        return replace(told, where=where, setup=stated or told.setup, notes=notes)
 
     def _of_images(self) -> dict[str, Path | None]:
         return {"--poses": self.poses, "--camera": self.camera, "--board": self.board}
 
-    def _require_no_images(self) -> None:
+    def _require_no_images(self, source: Source) -> None:
         """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
-        source = self.source
         place, held = source, "is a file of poses"
         if not isinstance(source, Path):
             place, held = source.where, "are poses"
@@ -249,8 +238,8 @@ class Files:
         times = f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
         for message, refused in {
             f"{extra}: only with a folder of images; {place} {held}": bool(extra),
-            "--image-times: only with a folder of images; poses have their times beside them": self.timing.image_times,
-            f"{times}and --poses, each with times": self.timing.offset and not timed,
+            "--image-times: only with a folder of images; poses have their times beside them": self.image_times,
+            f"{times}and --poses, each with times": self.time_offset and not timed,
         }.items():
             if refused:
                 raise InputError("E-OPTION-NEEDS", message)
@@ -265,11 +254,13 @@ class Files:
             with_pose = f"{len(own.row_of)} of {len(own.images)}"
             count = f"images: {with_pose} with a pose of the robot; the board was not looked for"
         else:
-            inputs = self.read()
+            source, notes = self._joined()
+            inputs = self._pairs(source, notes)
             stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
             lines, count = list(inputs.understood), f"pairs: {len(inputs.pairs)}"
             if not lines and not isinstance(source, HandEyeInput):
                 lines = own_told(source, self.quaternions)
+            lines = [*(f"note: {note}" for note in notes), *lines]
         setup = stated or "eye-in-hand"
         origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
         lines += [f"setup: {setup}, {origin}", count, *motions_missing(flange, setup)]
@@ -292,7 +283,7 @@ class _Photographs:
         self.files, self.folder, self.design, self.model = files, folder, load_boards(board), read_camera(camera)
         self.images, skipped = find_images(folder)
         names = [image.name for image in self.images]
-        self.robot, late, self.clock = robot_at_images(robot, names, files.timing)
+        self.robot, late, self.clock = robot_at_images(robot, names, files)
         names = [name for name in names if name not in dict(late)]
         self.row_of, missing, how = rows_of_images(self.robot, names)
         if not self.row_of:

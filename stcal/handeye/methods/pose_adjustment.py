@@ -136,10 +136,12 @@ SETTLED = 1e-4  # relative change of the estimated σ between rounds below which
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
-    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) of the residuals;
-    ``outliers`` : (m,); ``sigma`` : the estimated σ, by name; ``variance_factor`` : mean squared residual in units of
-    σ, over the ``redundancy``; ``settled`` : whether σ and outliers settled within :data:`ROUNDS`."""
+    """Solution of a ``loop``. ``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m,
+    6, 6) of the residuals; ``outliers`` : (m,); ``sigma`` : the estimated σ, by name; ``variance_factor`` : mean
+    squared residual in units of σ, over the ``redundancy``; ``settled`` : whether σ and outliers settled within
+    :data:`ROUNDS`."""
 
+    loop: Loop
     state: LoopState
     normal: np.ndarray
     residuals: np.ndarray
@@ -150,24 +152,55 @@ class PoseSolution:
     redundancy: int
     settled: bool
 
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        return tuple(self.sigma)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """Covariance (k, k) of X, Z (and the scale), of independent errors of the poses."""
+        return generalised_inverse(self.normal)
+
     def misfit(self, used: np.ndarray) -> float:
         """Returns minus twice the log-likelihood of the residuals of the poses ``used``, up to a constant."""
         covariance = self.covariance[used]
         return float(_squared(self.residuals[used], covariance).sum() + np.linalg.slogdet(covariance)[1].sum())
 
-    def without(self, loop: Loop, out: np.ndarray) -> LoopState:
-        """Returns the solution of the same ``loop`` without the poses ``out``, with the σ of the solution of all."""
-        used = ~self.outliers & ~np.isin(np.arange(len(loop)), out)
-        return _solved(loop[used], self.state, self.covariance[used], len(self.normal))[0]
+    def without(self, out: np.ndarray) -> LoopState:
+        """Returns the solution without the poses ``out``, with the σ of the solution of all."""
+        used = ~self.outliers & ~np.isin(np.arange(len(self.loop)), out)
+        return _solved(self.loop[used], self.state, self.covariance[used], len(self.normal))[0]
 
-    def scale_hint(self, loop: Loop) -> tuple[float, float]:
-        """Returns the scale, one step from the solution, if it were solved for, and its σ."""
-        used = ~self.outliers
-        jacobian = loop[used].jacobian(self.state.mount_from_camera, self.state.scale, 13)
-        weighted = np.linalg.solve(self.covariance[used], jacobian)
+    def weighted(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the derivatives (u, 6, count) of the residuals of the poses used, and these over the covariances."""
+        used, (x, _, scale) = ~self.outliers, self.state
+        jacobian = self.loop[used].jacobian(x, scale, count)
+        return jacobian, np.linalg.solve(self.covariance[used], jacobian)
+
+    def slope(self, by_unknown: np.ndarray) -> np.ndarray:
+        """Returns the derivative (k, q) of the gradient of X, Z (and the scale) by what moves the board's poses (m, 6,
+        q), which were weighed by their other errors."""
+        moves = self.loop.by_camera(self.state.mount_from_camera, self.state.scale) @ by_unknown
+        return np.einsum("mai,maj->ij", self.weighted(len(self.normal))[1], moves[~self.outliers])
+
+    @property
+    def scale_hint(self) -> tuple[float, float]:
+        """The scale, one step from the solution, if it were solved for, and its σ."""
+        jacobian, weighted = self.weighted(UNKNOWNS + 1)
         inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
-        step = -inverse[12] @ np.einsum("mai,ma->i", weighted, self.residuals[used])
-        return self.state.scale + float(step), float(np.sqrt(inverse[12, 12]))
+        step = -inverse[UNKNOWNS] @ np.einsum("mai,ma->i", weighted, self.residuals[~self.outliers])
+        return self.state.scale + float(step), float(np.sqrt(inverse[UNKNOWNS, UNKNOWNS]))
+
+    def by_places(self) -> ByClusters | None:
+        """Returns the covariance of X, Z (and the scale) where the robot stood several times at one place: what it errs
+        there is one error, not several. None if each pose has a place of its own."""
+        if (place := places(self.loop[~self.outliers])) is None:
+            return None
+        jacobian, weighted = self.weighted(len(self.normal))
+        member = np.eye(place.max() + 1)[place]
+        pull = -np.einsum("mai,ma->mi", weighted, self.residuals[~self.outliers])
+        information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
+        return by_clusters(self.normal, member.T @ pull, information)
 
 
 def adjust_poses(
@@ -176,7 +209,7 @@ def adjust_poses(
     """Returns the least-squares solution of the loop's residuals over their σ at the board's origin, from a start:
     maximum likelihood for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without the metric's free
     parameter). Raises ConvergenceError: no minimum is reached."""
-    count, state, residuals = 12 + with_scale, start, loop.residuals(*start)
+    count, state, residuals = UNKNOWNS + with_scale, start, loop.residuals(*start)
     parts = components(loop, noise, state.mount_from_camera, state.scale)
     first, least = parts.first(residuals)
     variances, limits = first, (least, first * np.exp(2 * FARTHEST))
@@ -202,7 +235,7 @@ def adjust_poses(
     residuals, redundancy = loop.residuals(*state), max(6 * int(used.sum()) - count, 1)
     sigma = {name: float(v) for name, v in zip(parts.names, np.sqrt(variances), strict=True)}
     factor = float(_squared(residuals, covariance)[used].sum() / redundancy)
-    return PoseSolution(state, normal, residuals, covariance, ~used, sigma, factor, redundancy, settled)
+    return PoseSolution(loop, state, normal, residuals, covariance, ~used, sigma, factor, redundancy, settled)
 
 
 def places(loop: Loop) -> np.ndarray | None:
@@ -215,21 +248,6 @@ def places(loop: Loop) -> np.ndarray | None:
         place[i] = place[same[0]] if len(same) else i
     first, place = np.unique(place, return_inverse=True)
     return place if LEAST_POSES <= len(first) < len(loop) else None
-
-
-def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
-    """Returns the covariance of X, Z (and the scale) where the robot stood several times at one place: what it errs
-    there is one error, not several. None if each pose has a place of its own."""
-    used = ~solution.outliers
-    own = loop[used]
-    place = places(own)
-    if place is None:
-        return None
-    jacobian = own.jacobian(solution.state.mount_from_camera, solution.state.scale, len(solution.normal))
-    weighted, member = np.linalg.solve(solution.covariance[used], jacobian), np.eye(place.max() + 1)[place]
-    pull = -np.einsum("mai,ma->mi", weighted, solution.residuals[used])
-    information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
-    return by_clusters(solution.normal, member.T @ pull, information)
 
 
 def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
@@ -273,7 +291,12 @@ def _agreeing(
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian
     solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)
-    value, vector = np.linalg.eigh(np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved)
-    turned = np.einsum("mab,ma->mb", vector, white)
-    agrees = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1) <= limit
+    agrees = squared_within(white, np.eye(6) + np.where(used, -1, 1)[:, None, None] * solved, SEEN) <= limit
     return agrees if agrees.sum() >= LEAST_POSES else used
+
+
+def squared_within(values: np.ndarray, variance: np.ndarray, least: float) -> np.ndarray:
+    """Returns squares (m,) of values (m, 6) over their variance (m, 6, 6), along directions with the ``least`` one."""
+    own, axes = np.linalg.eigh(variance)
+    along = np.einsum("mab,ma->mb", axes, values)
+    return np.where(own > least, along**2 / np.maximum(own, least), 0).sum(1)

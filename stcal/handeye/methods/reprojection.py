@@ -17,7 +17,7 @@ from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.geometry.robust import length_limit
-from stcal.handeye.data.corner_views import Views, resect, whitened
+from stcal.handeye.data.corner_views import Views, whitened
 from stcal.handeye.data.pose_pairs import Loop, LoopState
 from stcal.handeye.methods.pose_adjustment import (
     CAUTION,
@@ -27,6 +27,7 @@ from stcal.handeye.methods.pose_adjustment import (
     UNKNOWNS,
     Noise,
     PoseSolution,
+    squared_within,
 )
 from stcal.io.cameras.camera_model import CameraPrior
 
@@ -93,11 +94,9 @@ class Reprojection:
         scale = np.linalg.norm(self.corners) / np.linalg.norm(self.designed)
         return np.where((distance < 10.0**-SAME_DIGITS)[:, None], self.corners[nearest], scale * np.asarray(xyz_board))
 
-
-def resected(names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
-    """Returns camera_from_board of all views by the adjusted camera and board."""
-    seen = tuple(view.moved(board.board(view.xyz_board)) for view in views.views)
-    return resect(Views(board.camera, seen), names)[0]
+    def adjusted(self, views: Views) -> Views:
+        """Returns the views by the adjusted camera, with corners at their places on the adjusted board."""
+        return Views(self.camera, tuple(view.moved(self.board(view.xyz_board)) for view in views.views))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +117,8 @@ class Corners:
 
     ``loop`` : the m poses, as reported; ``xyz_board`` : (K, 3) as designed; ``view``, ``corner`` : (n,) view and corner
     of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1; ``sigma`` : σ of each kind, 0
-    where exact; ``basis`` : (16, q) of the intrinsics solved for; ``information`` : (q, q) of them about ``camera``, to
-    be divided by the squares of the factors; ``with_scale``.
+    where exact; ``free`` : kinds whose σ are to be estimated; ``basis`` : (16, q) of the intrinsics solved for;
+    ``information`` : (q, q) of them about ``camera``, to be divided by the squares of the factors; ``with_scale``.
     """
 
     loop: Loop
@@ -129,10 +128,37 @@ class Corners:
     xy_px: np.ndarray
     weight: np.ndarray
     sigma: dict[str, float]
+    free: tuple[str, ...]
     camera: Camera
     basis: np.ndarray
     information: np.ndarray
     with_scale: bool
+
+    @classmethod
+    def of(
+        cls, loop: Loop, views: Views, noise: Noise, intrinsics: CameraPrior | None = None, with_scale: bool = False
+    ) -> "Corners":
+        """Returns the problem of poses and views, with σ that are not stated from :data:`FIRST`."""
+        seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
+        designed, corner = np.unique(seen, axis=0, return_inverse=True)
+        stated = {name: getattr(noise, name) for name in FIRST}
+        sigma = {name: FIRST[name] if value is None else value for name, value in stated.items()}
+        known = ROBOT if loop.robot_covariance is not None else ()
+        free = tuple(name for name, value in stated.items() if value is None and name not in known)
+        if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of them only: tiny σ there
+            sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
+        view = np.repeat(np.arange(len(views)), [len(each) for each in views.views])
+        xy_px = np.concatenate([each.xy_px for each in views.views])
+        measured = view, corner.ravel(), xy_px, np.concatenate([each.whitening() for each in views.views])
+        none = np.zeros((len(PARAMETER_NAMES), 0)), np.zeros((0, 0))
+        corners = cls(loop, designed, *measured, sigma, free, views.camera, *none, with_scale)
+        return corners if intrinsics is None else corners.with_lens(*lens_of(intrinsics))
+
+    def with_lens(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
+        """Returns the problem with intrinsics among the unknowns, and factors of their σ, from 1."""
+        factors = dict.fromkeys((name for name, _ in camera_parts(basis, information)), 1.0)
+        own = {"sigma": self.sigma | factors, "free": (*self.free, *factors)}
+        return replace(self, basis=basis, information=information, **own)
 
     @property
     def robot(self) -> np.ndarray | None:
@@ -233,10 +259,6 @@ class Corners:
         same = {name: getattr(self, name)[rows] for name in ("corner", "xy_px", "weight")}
         return replace(self, loop=self.loop[keep], view=(np.cumsum(keep) - 1)[self.view[rows]], **same)
 
-    def factors(self) -> dict[str, float]:
-        """Returns a factor of 1 for each kind of the intrinsics solved for."""
-        return dict.fromkeys((name for name, _ in camera_parts(self.basis, self.information)), 1.0)
-
 
 def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Returns names and rows of the intrinsics with a factor on their prior σ: by kind, or all if they are correlated.
@@ -249,48 +271,30 @@ def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, 
     return [(name, rows) for name, rows in parts if len(rows)]
 
 
-def problem(
-    loop: Loop, views: Views, noise: Noise, intrinsics: CameraPrior | None = None, with_scale: bool = False
-) -> tuple[Corners, tuple[str, ...]]:
-    """Returns the problem, and the groups whose σ are to be estimated, from :data:`FIRST`."""
-    seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
-    designed, corner = np.unique(seen, axis=0, return_inverse=True)
-    stated = {name: getattr(noise, name) for name in ("corner_px", *ROBOT, "board_mm")}
-    sigma = {name: FIRST[name] if value is None else value for name, value in stated.items()}
-    free = [name for name, value in stated.items() if value is None]
-    if sigma["robot_rad"] or sigma["robot_mm"]:  # exact in one of them only: tiny σ there
-        sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
-    if loop.robot_covariance is not None:
-        free = [name for name in free if not name.startswith("robot")]
-    basis = np.zeros((len(PARAMETER_NAMES), 0)) if intrinsics is None else intrinsic_basis(intrinsics.colmap_model)
-    information = np.zeros((0, 0)) if intrinsics is None else np.linalg.inv(intrinsics.covariance)
-    view = np.repeat(np.arange(len(views)), [len(each) for each in views.views])
-    xy_px = np.concatenate([each.xy_px for each in views.views])
-    measured = view, corner.ravel(), xy_px, np.concatenate([each.whitening() for each in views.views])
-    corners = Corners(loop, designed, *measured, sigma, views.camera, basis, information, with_scale)
-    factors = corners.factors()
-    return replace(corners, sigma=sigma | factors), (*free, *factors)
+def lens_of(prior: CameraPrior) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the basis (16, q) of a camera's intrinsics, and their information (q, q)."""
+    return intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
 
 
-def adjust(corners: Corners, values: dict[str, Any], free: tuple[str, ...]) -> tuple[Corners, Solution, bool]:
-    """Solves, and estimates the σ of the ``free`` kinds, in rounds: returns the problem with these σ, its solution, and
-    whether σ settled; raises ConvergenceError: no minimum is reached."""
+def adjust(corners: Corners, values: dict[str, Any]) -> tuple[Corners, Solution, bool]:
+    """Solves, and estimates the free σ, in rounds: returns the problem with these σ, its solution, and whether σ
+    settled; raises ConvergenceError: no minimum is reached."""
     if not np.isfinite(corners.problem().cost(values)):
         raise ConvergenceError("E-NO-MINIMUM", f"hand-eye: corners lie behind the camera at the start; {WORST}")
-    settled = not free
-    for _ in range(ADJUST_ROUNDS if free else 0):
+    settled = not corners.free
+    for _ in range(0 if settled else ADJUST_ROUNDS):
         solution = corners.problem().minimum(values, settled=ROUGHLY).required("hand-eye", WORST).linear
         values, before = solution.values, corners.sigma
-        corners = replace(corners, sigma=before | estimated(corners, solution, free))
-        settled = bool(max(abs(np.log(corners.sigma[name] / before[name])) for name in free) < SETTLED)
+        corners = replace(corners, sigma=before | estimated(corners, solution))
+        settled = bool(max(abs(np.log(corners.sigma[name] / before[name])) for name in corners.free) < SETTLED)
         if settled:
             break
     return corners, corners.problem().minimum(values).required("hand-eye", WORST).linear, settled
 
 
-def estimated(corners: Corners, solution: Solution, free: tuple[str, ...]) -> dict[str, float]:
-    """Returns restricted maximum-likelihood σ of the ``free`` kinds, all else linear."""
-    present = [name for name in free if any(name in factor.kinds for factor in solution.problem.factors)]
+def estimated(corners: Corners, solution: Solution) -> dict[str, float]:
+    """Returns restricted maximum-likelihood σ of the free kinds, all else linear."""
+    present = [name for name in corners.free if any(name in factor.kinds for factor in solution.problem.factors)]
     least = np.log([LEAST_SIGMA.get(name, 1.0) / corners.sigma[name] for name in present])
     caution = np.array([CAUTION if name in LEAST_SIGMA else 0.0 for name in present])
     farthest = np.full(len(present), FARTHEST)
@@ -299,13 +303,13 @@ def estimated(corners: Corners, solution: Solution, free: tuple[str, ...]) -> di
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(present, best, strict=True)}
 
 
-def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior, inverse: np.ndarray) -> np.ndarray:
+def of_poses(solution: PoseSolution, views: Views, prior: CameraPrior, inverse: np.ndarray) -> np.ndarray:
     """Returns the covariance (k, k) that intrinsics as filed, by which the board's poses were computed from ``views``,
     add to the ``inverse`` normal matrix (k, k) of X, Z (and the scale)."""
-    basis = intrinsic_basis(prior.colmap_model)
+    basis, known = lens_of(prior)
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
-    for view, pose in zip(views.views, loop.camera_from_board, strict=True):
+    for view, pose in zip(views.views, solution.loop.camera_from_board, strict=True):
         white, by_board = whitened(view, views.camera, pose)
         point = pose @ view.xyz_board
         by_own = view.whitening() @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis
@@ -318,24 +322,14 @@ def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrio
     gain = float(gradient @ generalised_inverse(information) @ gradient)
     redundancy = 2 * views.corners() - 6 * len(views) - q
     variance = (cost - gain) / redundancy if redundancy > 0 else 1.0
-    moved = inverse @ slope(loop, solution, np.array(slopes))
-    return moved @ moment(information / variance, gradient / variance, basis, prior) @ moved.T
+    moved = inverse @ solution.slope(np.array(slopes))
+    return moved @ moment(information / variance, gradient / variance, basis, known) @ moved.T
 
 
-def slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
-    """Returns the derivative (k, q) of the gradient of X, Z (and the scale) by what moves the board's poses (m, 6, q),
-    which were weighed by their other errors."""
-    used = np.flatnonzero(~solution.outliers)
-    x, _, scale = solution.state
-    jacobian, moves = loop.jacobian(x, scale, len(solution.normal)), loop.by_camera(x, scale) @ by_unknown
-    weighted = np.linalg.solve(solution.covariance[used], moves[used])
-    return np.einsum("mai,maj->ij", jacobian[used], weighted)
-
-
-def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, prior: CameraPrior) -> np.ndarray:
+def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Returns the second moment (q, q) of the intrinsics' error: squared estimate plus covariance. Where corners
-    contradict the prior, its σ are widened by kind, by maximum likelihood (EM: Dempster, Laird & Rubin 1977)."""
-    known = np.linalg.inv(prior.covariance)
+    contradict what is ``known`` (q, q), its σ are widened by kind, by maximum likelihood (EM: Dempster, Laird & Rubin
+    1977)."""
     parts = [rows for _, rows in camera_parts(basis, known)]
     squared = np.ones(len(parts))
     for _ in range(ROUNDS):
@@ -357,17 +351,16 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, pri
 class AdjustedCorners:
     """An adjustment of corners.
 
-    ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses,
-    ``solution`` : its solution; ``inverse`` : covariance of its kept unknowns; ``estimated`` : kinds whose σ were
-    estimated; ``settled`` : whether σ settled.
+    ``loop``, ``views`` : all; ``used`` : (m,) which of them were used; ``corners`` : problem of these, ``solution`` :
+    its solution; ``inverse`` : covariance of its kept unknowns; ``settled`` : whether σ settled.
     """
 
     loop: Loop
+    views: Views
     used: np.ndarray
     corners: Corners
     solution: Solution
     inverse: np.ndarray
-    estimated: tuple[str, ...]
     settled: bool
 
     @cached_property
@@ -375,15 +368,13 @@ class AdjustedCorners:
         return self.corners.bundle(self.solution.values)
 
     @property
+    def estimated(self) -> tuple[str, ...]:
+        return self.corners.free
+
+    @property
     def sigma(self) -> dict[str, float]:
         """The σ by kind that are not 0."""
         return {name: float(value) for name, value in self.corners.sigma.items() if value}
-
-    @property
-    def sigma_scale(self) -> float | None:
-        """σ of the scale, if it was solved for."""
-        at = self.solution.places["scale"]
-        return float(np.sqrt(self.inverse[at, at].item())) if self.corners.with_scale else None
 
     @property
     def outliers(self) -> np.ndarray:
@@ -408,7 +399,7 @@ class AdjustedCorners:
 
     def camera_gain(self) -> float:
         """Returns the fall of the cost per intrinsic if these were solved for by one step: 1 if the camera is right."""
-        _, wider = self._with_intrinsics(*UNKNOWN_LENS)
+        _, wider = self._with_lens(*UNKNOWN_LENS)
         gain = float(wider.right @ generalised_inverse(wider.normal) @ wider.right) + wider.reduction.gain
         return gain / UNKNOWN_LENS[0].shape[1]
 
@@ -416,16 +407,14 @@ class AdjustedCorners:
         """Returns the covariance (12, 12) of X and Z with the errors of the intrinsics as filed, which are *considered*
         (Schmidt 1966; Bierman 1977, ch. VIII): their ``prior`` covariance is carried through. Estimated σ, too large by
         the camera's error, are estimated again with them, linear about the state. ``inverse`` : without them."""
-        lens = intrinsic_basis(prior.colmap_model), np.linalg.inv(prior.covariance)
-        free, (wider, linear) = self.estimated, self._with_intrinsics(*lens)
-        factors = wider.factors()
-        sigma = wider.sigma | estimated(wider, linear, (*free, *factors))
+        free, (wider, linear) = self.estimated, self._with_lens(*lens_of(prior))
+        sigma = wider.sigma | estimated(wider, linear)
         again = replace(wider, sigma=sigma).problem().at(linear.values)
         covariance = generalised_inverse(again.normal)
         camera = np.arange(len(covariance))[linear.places["camera"]]
         error = covariance[camera] @ again.right
         # What each kind of observation tells, in units of the σ that weighted the solution.
-        kinds = {kind for factor in linear.problem.factors for kind in factor.kinds} - set(factors)
+        kinds = {kind for factor in linear.problem.factors for kind in factor.kinds if not kind.startswith("camera_")}
         told = {kind: linear.equations((kind,)).told(linear.reduction.from_kept) for kind in kinds}
         normal = np.sum(list(told.values()), axis=0)
         share = {kind: (sigma[kind] / wider.sigma[kind]) ** 2 if kind in free else 1.0 for kind in kinds}
@@ -439,14 +428,14 @@ class AdjustedCorners:
         by_camera = moved @ normal[:, camera]
         return moved @ scattered @ moved.T + by_camera @ second_moment @ by_camera.T
 
-    def _with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> tuple[Corners, Solution]:
-        """Returns the problem with intrinsics among the unknowns, factors of their σ at 1, and it about the state."""
-        wider = replace(self.corners, basis=basis, information=information)
-        wider = replace(wider, sigma=wider.sigma | wider.factors())
+    def _with_lens(self, basis: np.ndarray, information: np.ndarray) -> tuple[Corners, Solution]:
+        """Returns the problem with intrinsics among the unknowns, and it about the state."""
+        wider = self.corners.with_lens(basis, information)
         return wider, wider.problem().at(self.solution.values | {"camera": Vector(np.zeros((1, basis.shape[1])))})
 
+    @property
     def normal(self) -> np.ndarray:
-        """Returns the normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
+        """Normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
         normal, k = self.solution.normal, UNKNOWNS
         return normal[:k, :k] - normal[:k, k:] @ generalised_inverse(normal[k:, k:]) @ normal[k:, :k]
 
@@ -484,15 +473,15 @@ def adjust_views(
             said = f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
             said += "belong together, and the conventions of both"
             raise DegenerateError("E-HANDEYE-DISAGREE", said)
-        corners, free = problem(loop[rows], views[rows], noise, intrinsics, with_scale)
-        corners, solution, settled = adjust(corners, corners.start(first), free)
+        corners = Corners.of(loop[rows], views[rows], noise, intrinsics, with_scale)
+        corners, solution, settled = adjust(corners, corners.start(first))
         inverse = generalised_inverse(solution.normal)
         bad = contradicting(corners, solution, inverse)
         if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
             break
         used[rows[bad]] = False
         good -= int(bad.sum())
-    return AdjustedCorners(loop, used, corners, solution, inverse, free, settled)
+    return AdjustedCorners(loop, views, used, corners, solution, inverse, settled)
 
 
 def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> np.ndarray:
@@ -505,9 +494,7 @@ def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> 
     white = np.einsum("mab,mb->ma", weight, solution.values["robot"].difference(Poses.of([Rigid()] * m)))
     covariance = inverse[at, at].reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
     # For Gaussian knowledge δ ~ N(0, Σ) with posterior covariance C, the estimate of δ scatters by Σ − C.
-    value, vector = np.linalg.eigh(np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2))
-    turned = np.einsum("mab,ma->mb", vector, white)
-    squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
+    squared = squared_within(white, np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2), SEEN)
     redundancy = max(6 * (m - 1) - at.start + (not corners.with_scale), 6)
     return squared > 6 * fdtri(6, redundancy, 1 - FALSE_ALARM / m)
 

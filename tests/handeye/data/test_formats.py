@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_robot
 from stcal.handeye.data.pose_partners import rows_of_images
-from stcal.workflows.handeye_inputs import Files, one_source
+from stcal.workflows.handeye_inputs import Files
 from tests.handeye.test_cli import NOISE
 from tests.handeye.written import FORMATS, REFUSED, easy_handeye, matrices, poses_file
 from tests.outcome import INPUT, assert_error, fails_with
@@ -27,10 +27,8 @@ def read(arguments, path=None):
     for name, value in zip(own[::2], own[1::2], strict=True):
         options[name].append(value)
     said = Said.of_options(options["--rotation"], options["--length-unit"], options["--poses-are"])
-    if source is not None:
-        return Files(Path(source), statements=said).read()
-    told, _ = one_source(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
-    return Files(told, statements=said).read()
+    first, second = (source, None) if source is not None else (options["--a"][0], Path(options["--b"][0]))
+    return Files(Path(first), second=second, statements=said).read()
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -53,7 +51,7 @@ def test_other_formats_are_refused_in_a_line(name, tmp_path):
     np.save(tmp_path / "b.npy", np.array([pose.matrix() for pose in PAIRS.camera_from_board])[:1])
     for call in (
         lambda: read_robot(path, Said()),
-        lambda: one_source(path, tmp_path / "b.npy", "image", Said(rotation="rotvec-rad", length_unit="m")),
+        Files(path, second=tmp_path / "b.npy", statements=Said(rotation="rotvec-rad", length_unit="m")).read,
         Files(path).read,
     ):
         with pytest.raises(InputError) as caught:

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_pairs, read_robot, read_two
 from stcal.handeye.data.pose_partners import partners
-from stcal.workflows.handeye_inputs import Files, one_source
+from stcal.workflows.handeye_inputs import Files
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
@@ -267,5 +267,5 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     path.write_text(f"{head}\n{between.join('123456')}\n")
     said = Said(rotation="ur-rotvec")
     refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
-    refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
+    refuses("E-POSES-NOT-FOUND … u", Files(path, second=path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", read_robot, path, said)
