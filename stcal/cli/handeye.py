@@ -153,12 +153,12 @@ def handeye(
     from stcal.handeye import handeye_file as forms
     from stcal.handeye.handeye_file import HandEyeFile
     from stcal.handeye.handeye_page import outcome_report
-    from stcal.handeye.handeye_pipeline import judged
+    from stcal.handeye.handeye_pipeline import ALL, judged
     from stcal.handeye.handeye_problem import SCALED
     from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.static_transforms import messages
-    from stcal.workflows.handeye_run import ALL, calibrate_handeye, without_flips
+    from stcal.workflows.handeye_run import calibrate_handeye, without_flips
 
     turns = (None if each is None else math.radians(each) for each in (sigma_robot_deg, sigma_camera_deg))
     noise = Noise(next(turns), sigma_robot_mm, next(turns), sigma_camera_mm, sigma_px, sigma_board_mm)
@@ -222,7 +222,7 @@ def handeye(
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
         if given_ and result.method not in able:
             say(f"note: {option} does nothing for {result.method}, only for {' and '.join(able)}")
-    for name, reason in outcome.left_out:
+    for name, reason in outcome.given.left_out:
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))

@@ -234,8 +234,7 @@ def _differ(loop: Loop) -> tuple[float, float]:
 
 def _typical(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.median) -> tuple[float, float]:
     """Returns the median residuals of a first solution, or another ``middle``, rad and mm."""
-    residuals = loop.residuals(*guess(loop, with_scale)).reshape(-1, 2, 3)
-    turn, shift = middle(np.linalg.norm(residuals, axis=2), axis=0)
+    turn, shift = middle(loop.misses(*guess(loop, with_scale)), axis=0)
     return float(turn), float(shift)
 
 
@@ -308,8 +307,7 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
         x, z, _ = closed_form.robust(chosen)
         costs = []
         for variant in variants:
-            misses = replace(loop, camera_from_board=variant).residuals(x, z).reshape(-1, 2, 3)
-            turn, shift = np.linalg.norm(misses, axis=2).T
+            turn, shift = replace(loop, camera_from_board=variant).misses(x, z).T
             costs.append(np.hypot(turn * np.linalg.norm(variant.translation, axis=1), shift))
         better = np.argmin(costs, axis=0)
         if (better == labels).all():
@@ -332,5 +330,5 @@ def tilted(poses: Poses) -> Poses:
 def flipped(loop: Loop, x: Rigid, z: Rigid, outliers: np.ndarray) -> np.ndarray:
     """Returns a mask (m,) of the ``outliers`` that agree with the solution when they are tilted the other way."""
     other = replace(loop, camera_from_board=tilted(loop.camera_from_board))
-    before, after = (np.linalg.norm(each.residuals(x, z)[:, :3], axis=1) for each in (loop, other))
+    before, after = (each.misses(x, z)[:, 0] for each in (loop, other))
     return outliers & (after < PUT_RIGHT * before)

@@ -147,10 +147,11 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        result, held_out, pitch_mm = outcome.result, outcome.held_out, outcome.pitch_mm
-        pitch_mm = pitch_mm and pitch_mm * result.scale
+        given, result, held_out = outcome.given, outcome.result, outcome.held_out
+        pitch_mm = given.pitch_mm and given.pitch_mm * result.scale
         same = ("setup", "method", "covariance", "sigma", "estimated", "observability")
-        optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
+        optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset")}
+        optional["understood"] = given.understood
         if whole:
             optional |= {"splits": held_out, "methods": [_method(each) for each in outcome.compared]}
         adjusted, poses = result.reprojection, []
@@ -160,7 +161,7 @@ class HandEyeFile(ResultFile):
         content = {
             "format": "stcal handeye 1",
             "version": stcal.__version__,
-            "where": outcome.where,
+            "where": given.where,
             "verdict": judged(outcome),
             **{name: getattr(result, name) for name in same},
             **result.transforms,
@@ -171,7 +172,7 @@ class HandEyeFile(ResultFile):
             "rms": dict(zip(("rotation_rad", "translation_mm"), result.rms(), strict=True)),
             "poses": poses,
             "outliers": outcome.outliers(),
-            "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
+            "left_out": [{"name": name, "reason": reason} for name, reason in given.left_out],
             "held_out": held_out and held_out.summary(result.outliers),
             "notes": outcome.all_notes(),
         }

@@ -94,7 +94,7 @@ def outcome_report(outcome: Outcome) -> Document:
     judged_by = [[f.title, verdict_word(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
     judgements = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judged_by, css="text")
     asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
-    told = {"To know": asides, "What the files were taken for": outcome.understood}
+    told = {"To know": asides, "What the files were taken for": outcome.given.understood}
     camera = Table(["<", "value", "± σ", "<unit"], _adjusted(outcome))
     answer: list[Block] = [
         tiles(_tiles(outcome)),
@@ -122,7 +122,7 @@ def outcome_report(outcome: Outcome) -> Document:
     reasons = [": ".join(filter(None, (each.said, each.remedy))) for each in found.reasons()]
     return Document(
         f"Hand-eye calibration: {frames.camera}",
-        f"{outcome.where}: {result.setup}, {result.method}: {len(rows) - len(bad)} poses{without if bad else ''}",
+        f"{outcome.given.where}: {result.setup}, {result.method}: {len(rows) - len(bad)} poses{without if bad else ''}",
         [
             Section("Result", answer, terminal=True),
             Section("What was tried", _tried(outcome.choice), terminal=True),
@@ -131,7 +131,7 @@ def outcome_report(outcome: Outcome) -> Document:
             Section("Poses", poses),
             Section("Coverage of the image", [Html(lambda: html(*_coverage(outcome)))]),
             Section("What the motions tell", _turns(outcome)),
-            Section("Left out", [page_only(Table(["<image", "<reason"], outcome.left_out))]),
+            Section("Left out", [page_only(Table(["<image", "<reason"], outcome.given.left_out))]),
         ],
         banner=[
             found.answer(),
@@ -210,12 +210,12 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
 
 def _coverage(outcome: Outcome) -> list[Block]:
     """Returns how much of the image the board covered, with the residuals over it."""
-    views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
-    if views is None or pairs is None:
+    views, board = outcome.given.views, outcome.result.reprojection
+    if views is None:
         return []
     if board is None:
         measured, by = np.concatenate([view.xy_px for view in views.views]), "robot and transforms"
-        residuals = np.concatenate(by_robot(outcome.result, pairs, views)) - measured
+        residuals = np.concatenate(by_robot(outcome.result, outcome.given.pairs, views)) - measured
     else:
         measured, by = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)]), "the adjustment"
         residuals = board.residuals_px
@@ -252,7 +252,7 @@ def _turns(outcome: Outcome) -> list[Block]:
 
 def _scale_text(outcome: Outcome) -> str:
     """Returns the estimated size of the board and its σ, in words; empty where it was not solved for."""
-    scale, sigma, pitch = outcome.result.scale, outcome.result.sigma_scale, outcome.pitch_mm
+    scale, sigma, pitch = outcome.result.scale, outcome.result.sigma_scale, outcome.given.pitch_mm
     if sigma is None:
         return ""
     text = f"board: {scale:.5f} ± {sigma:.5f} times its stated size"

@@ -14,8 +14,9 @@ from stcal.geometry.rigid import by_pose
 from stcal.handeye.choose import ChosenWay, choose
 from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_files import HandEyeInput
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, LengthUnit, Loop, Setup
-from stcal.handeye.handeye_problem import HandEye, HandEyeOptions, HandEyeProblem
+from stcal.handeye.handeye_problem import METHODS, HandEye, HandEyeOptions, problem_of
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS
 from stcal.handeye.remarks import (
     BAD,
@@ -34,7 +35,7 @@ from stcal.handeye.remarks import (
     spoken,
 )
 from stcal.handeye.time_offset import TimeOffset
-from stcal.handeye.validate import LEAST_LEFT, Compared, HeldOutMotions, HeldOutPoses, refitted, splits
+from stcal.handeye.validate import LEAST_LEFT, Compared, HeldOutMotions, HeldOutPoses, compare, refitted, splits
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
 
@@ -43,29 +44,21 @@ from stcal.parallel import one_thread
 class Outcome:
     """A calibration with everything that its report shows.
 
-    ``where`` : names of the files that were solved; ``result`` : HandEye; ``held_out`` : errors of the result's method
-    on held-out poses; ``compared`` : results of every method, if a comparison was asked for; ``options`` : by which the
-    result was solved; ``pitch_mm`` : pitch of dots or squares, as the board's file states it; ``left_out`` : images and
-    rows that did not take part, and why; ``notes`` : notes in addition to those of the result; ``motions`` : errors of
-    the last motions, held out; ``choice`` : the candidates that were tried, if no method was named; ``pairs``,
-    ``views`` : the poses that were solved, and their corners if there were images; a symmetric board's as numbered;
-    ``understood`` : how files of other programs were interpreted; ``time_offset`` : offset of the robot's clock from
-    the camera's, if it was solved for. σ of the result contain its σ.
+    ``given`` : what was solved, as numbered if the board is symmetric; ``held_out`` : errors of the result's method on
+    held-out poses; ``compared`` : results of every method, if a comparison was asked for; ``options`` : by which the
+    result was solved; ``notes`` : notes in addition to those of the result; ``motions`` : errors of the last motions,
+    held out; ``choice`` : the candidates that were tried, if no method was named; ``time_offset`` : offset of the
+    robot's clock from the camera's, if it was solved for. σ of the result contain its σ.
     """
 
-    where: str
+    given: HandEyeInput
     result: HandEye
     held_out: HeldOutPoses | None = None
     compared: tuple[Compared, ...] = ()
     options: HandEyeOptions = field(default_factory=HandEyeOptions)
-    pitch_mm: float | None = None
-    left_out: tuple[tuple[str, str], ...] = ()
     notes: tuple[str, ...] = ()
     motions: HeldOutMotions | None = None
     choice: ChosenWay | None = None
-    pairs: HandEyePoses | None = None
-    views: Views | None = None
-    understood: tuple[str, ...] = ()
     time_offset: TimeOffset | None = None
 
     @property
@@ -76,7 +69,8 @@ class Outcome:
     @property
     def own_sigmas(self) -> bool:
         """Whether corners came with covariances. The result's ``corner_px`` is then their factor."""
-        return self.views is not None and all(view.covariance is not None for view in self.views.views)
+        views = self.given.views
+        return views is not None and all(view.covariance is not None for view in views.views)
 
     def sentence(self) -> str:
         """Returns what was solved for and what that gains; empty if the user chose what to solve for."""
@@ -131,10 +125,11 @@ def judged(outcome: Outcome) -> Verdict:
 def _of_residuals(outcome: Outcome) -> Finding | None:
     """Refuses residuals that are too large for a sound robot and camera, even if they predict held-out poses well."""
     result, used = outcome.result, ~outcome.result.outliers
-    if outcome.pairs is None or not used.any():
+    if not used.any():
         return None
     turn, shift = result.rms()
-    away = result.scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
+    places = outcome.given.pairs.camera_from_board.translation[used]
+    away = result.scale * float(np.median(np.linalg.norm(places, axis=1)))
     if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
         return None
     size = f"{np.degrees(turn):.2g}°", f"{shift:.3g} mm"
@@ -197,9 +192,9 @@ def _of_share(outcome: Outcome) -> Finding | None:
 
 def _of_common_errors(outcome: Outcome) -> Finding | None:
     """Judges what the errors of the board's poses have in common: σ contain it, and more poses do not reduce it."""
-    title, result, pairs = "Common errors of the board's poses", outcome.result, outcome.pairs
+    title, result = "Common errors of the board's poses", outcome.result
     if (common := result.common_covariance) is None:
-        if pairs is None or pairs.camera_from_board_common is None or result.covariance is not None:
+        if outcome.given.pairs.camera_from_board_common is None or result.covariance is not None:
             return None
         said = f"{result.method} gives no σ, and the board's poses state errors that all have in common"
         return Finding(title, CARE, said, remedy="leave --method out: no residual shows these errors, only σ do")
@@ -215,14 +210,14 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
     """Returns the board's distance, σ there due to the transform (of ``covariance``, by default without common errors),
     and the RMS error of one pose, all in mm and 3-D."""
-    result, pairs = outcome.result, outcome.pairs
+    result = outcome.result
     if covariance is None and result.covariance is not None:
         common = result.common_covariance
         covariance = result.covariance if common is None else result.covariance - common
     shift, used = result.rms()[1], int((~result.outliers).sum())
-    if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
+    if covariance is None or used <= 2 or shift < NOTHING_MM:
         return None
-    place = pairs.camera_from_board.translation[~result.outliers] * result.scale
+    place = outcome.given.pairs.camera_from_board.translation[~result.outliers] * result.scale
     jacobian = by_pose(np.tile(np.eye(3), (used, 1, 1)), place @ result.mount_from_camera.rotation.T)
     variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
@@ -261,16 +256,14 @@ def _of_outliers(outcome: Outcome) -> Finding:
     result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
     if not bad:
         return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
-    flips: tuple[str, ...] = ()
-    if outcome.pairs is not None:
-        loop = Loop.of(outcome.pairs, result.setup)
-        tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
-        flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+    loop = Loop.of(outcome.given.pairs, result.setup)
+    tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
+    flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
     others, said, remedies = tuple(name for name in bad if name not in flips), [], []
     if flips:
         tilt = "poses are tilted the other way, as the second pose of a flat target is"
         said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
-        if outcome.views is None:
+        if outcome.given.views is None:
             undo = "solve with --undo-flips, which takes the other tilt, or give images, not the board's poses"
             remedies.append(undo)
     if others:
@@ -293,8 +286,12 @@ def _word(value: float, care: float, bad: float = np.inf) -> Word:
     return BAD if value > bad else CARE if value > care else GOOD
 
 
+ALL = "all"  # word in place of a method's name: all methods, compared
+
+
 def validated(
-    problem: HandEyeProblem,
+    given: HandEyeInput,
+    options: HandEyeOptions,
     method: str | None,
     rows: np.ndarray,
     prior: CameraPrior | None = None,
@@ -307,19 +304,22 @@ def validated(
     ``rows`` : (s, k) poses to hold out; ``prior`` : of intrinsics that may be solved for; ``choosing`` : among all
     ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
     """
-    known, notes = {"options": problem.options, "pairs": problem.pairs, "views": problem.views}, ()
-    try:
-        if choosing and len(rows):
-            choice = choose(problem, prior, rows, workers, progress)
-            known["options"] = choice.chosen.of(problem, prior).options
-            return Outcome("", choice.result, choice.held_out, choice=choice, **known)
-        result = problem.solved(method).result
-        if len(rows):
-            held_out = refitted(problem.mended(), method, rows, workers, progress)
-            return Outcome("", held_out.widened(result), held_out, **known)
-    except DegenerateError as error:  # if not of all poses, then of those besides some
-        result, notes = problem.solved(method).result, (f"no errors on poses held out: {error}",)
-    return Outcome("", result, notes=notes, **known)
+    problem, notes, compared, held_out = problem_of(given, options), (), (), None
+    if method == ALL:  # the result is that of the default method
+        result = problem.solved().result
+        compared = compare(given.pairs, problem.setup, given.views, options, METHODS, rows, workers, progress)
+        held_out = next(each.held_out for each in compared if each.method == result.method)
+    else:
+        try:
+            if choosing and len(rows):
+                choice = choose(problem, prior, rows, workers, progress)
+                options = choice.chosen.of(problem, prior).options
+                return Outcome(given, choice.result, choice.held_out, options=options, choice=choice)
+            result = problem.solved(method).result
+            held_out = refitted(problem.mended(), method, rows, workers, progress) if len(rows) else None
+        except DegenerateError as error:  # if not of all poses, then of those besides some
+            result, notes = problem.solved(method).result, (f"no errors on poses held out: {error}",)
+    return Outcome(given, held_out.widened(result) if held_out else result, held_out, compared, options, notes)
 
 
 @require_arguments
@@ -382,11 +382,11 @@ def handeye(
         raise InputError("E-POSES-COUNT", "hand-eye: give base_from_flange and camera_from_board of each pose")
     else:
         pairs = HandEyePoses.from_matrices(*sides, unit=unit)
-    problem = HandEyeProblem(pairs, asked, views, options or HandEyeOptions())
+    options = options or HandEyeOptions()
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
-    prior = None if views is None else problem.options.camera
-    choosing = method is None and not problem.options.names_unknowns
-    found = validated(problem, method, rows, prior, choosing)
+    prior = None if views is None else options.camera
+    choosing = method is None and not options.names_unknowns
+    found = validated(HandEyeInput("", pairs, views, setup=asked), options, method, rows, prior, choosing)
     x, z = found.result.mount_from_camera, found.result.stand_from_board
     outcome = replace(found, notes=(*found.notes, *of_setup(x, z, asked, setup is not None)))
     return replace(outcome.result, judgement=judged(outcome), notes=outcome.all_notes())

@@ -14,6 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import remarks
 from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views, resect
+from stcal.handeye.data.pose_files import HandEyeInput
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions
@@ -341,13 +342,13 @@ class HandEyeProblem:
         if sigma_scale is not None:
             require_scale(state.scale, sigma_scale, self.loop, self.pairs.where)
         notes += self._remarks(x, outliers, residuals, solution.scale_hint)
-        sigma, estimated = solution.sigma, solution.estimated
         if isinstance(solution, PoseSolution):
+            estimated = tuple(solution.sigma)
             stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-            sigma = {name: value for name, value in stated.items() if value} | sigma
+            sigma = {name: value for name, value in stated.items() if value} | solution.sigma
             covariance, common, doubts = self._of_poses(solution, noise, covariance)
         else:
-            doubts = self._of_camera(solution)
+            sigma, estimated, doubts = solution.sigma, solution.corners.free, self._of_camera(solution)
         notes += doubts if solution.settled else (*doubts, UNSETTLED)
         told = residuals, self.pairs.names, outliers, covariance[:6, :6], covariance[6:12, 6:12]
         more = state.scale, sigma_scale, sigma, estimated, board, self.seen, notes, common
@@ -444,6 +445,10 @@ class HandEyeProblem:
         note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along "
         note += "that axis"
         return x, z, generalised_inverse(held), (*self.notes, note)
+
+
+def problem_of(given: HandEyeInput, options: HandEyeOptions) -> HandEyeProblem:
+    return HandEyeProblem(given.pairs, given.setup or "eye-in-hand", given.views, options)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

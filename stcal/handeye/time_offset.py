@@ -144,8 +144,8 @@ def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Se
         if within.sum() < max(LEAST_POSES, LEAST_KEPT * len(seconds)):
             continue
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(seconds[within] + offset)), setup)
-        miss = loop.residuals(*closed_form.robust(loop, with_scale)).reshape(-1, 2, 3)
-        cost = float(np.log(np.median(np.linalg.norm(miss, axis=2), axis=0) + 1e-12).sum())
+        miss = np.median(loop.misses(*closed_form.robust(loop, with_scale)), axis=0)
+        cost = float(np.log(miss + 1e-12).sum())
         if cost < least:
             best, least = float(offset), cost
     if not np.isfinite(least):

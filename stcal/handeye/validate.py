@@ -233,7 +233,7 @@ def errors_of(result: HandEye, unseen: HandEyeProblem) -> dict[str, np.ndarray]:
         errors["board_mm"] = deciding_error(result, unseen)
         errors["pose_mm"] = np.array([np.linalg.norm(each, axis=1).mean() for each in off])
         loop, scale = replace(loop, camera_from_board=by_view), 1.0
-    turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
+    turn, shift = loop.misses(x, z, scale).T
     return {"rotation_rad": turn, "translation_mm": shift, **errors}
 
 
@@ -290,8 +290,7 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
 def _robust_miss(problem: HandEyeProblem, setup: Setup) -> float:
     """Returns the product of median rotation and translation (rad mm) by which a quick solution misses the poses."""
     loop = Loop.of(problem.pairs, setup)
-    misses = loop.residuals(*robust(loop, problem.options.with_scale)).reshape(-1, 2, 3)
-    return float(np.median(np.linalg.norm(misses, axis=2), axis=0).prod())
+    return float(np.median(loop.misses(*robust(loop, problem.options.with_scale)), axis=0).prod())
 
 
 @require_arguments

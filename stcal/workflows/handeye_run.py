@@ -1,7 +1,6 @@
 """Hand-eye calibration from a file of poses or from images of any board, for ``stcal handeye``, and the poses to take
 next within an arm's reach. The offset of the clocks may be unknown too. It composes three systems."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,18 +14,16 @@ from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.conventions import flipped, tilted
 from stcal.handeye.data.pose_pairs import rms_of
 from stcal.handeye.data.stream import LONGEST_S, Timed
-from stcal.handeye.handeye_pipeline import Outcome, validated
-from stcal.handeye.handeye_problem import HandEye, HandEyeProblem
+from stcal.handeye.handeye_pipeline import ALL, Outcome, validated
+from stcal.handeye.handeye_problem import HandEye, HandEyeProblem, problem_of
 from stcal.handeye.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from stcal.handeye.validate import LEAST_LEFT, better_setup, compare, predict_motions, splits
+from stcal.handeye.validate import LEAST_LEFT, better_setup, predict_motions, splits
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
 from stcal.workflows.handeye_inputs import HandEyeInput
-
-ALL = "all"  # word in place of a method's name: all methods, compared
 
 
 @require_arguments
@@ -80,12 +77,8 @@ def calibrate_handeye(
         pairs, rows = given.pairs, np.zeros((0, 0), int)
         if repeats and (held_out or len(pairs) > LEAST_LEFT):
             rows = splits(len(pairs), held_out, repeats, seed)
-        problem = problem_of(given, options)
-        if method == ALL:
-            outcome = _compared(problem, rows, workers, partial(told, "methods"))
-        else:
-            prior = given.prior if given.views is not None else None
-            outcome = validated(problem, method, rows, prior, choosing, workers, partial(told, "held out"))
+        stage, prior = "methods" if method == ALL else "held out", given.prior if given.views is not None else None
+        outcome = validated(given, options, method, rows, prior, choosing, workers, partial(told, stage))
         problem, result, notes = problem_of(given, outcome.options), outcome.result, outcome.notes
         if len(rows):
             notes += better_setup(problem, rows)
@@ -99,30 +92,14 @@ def calibrate_handeye(
         last, mended = None, problem.mended()
         if motions is not None:
             last = predict_motions(pairs, problem.setup, result.method, given.views, problem.options, motions)
-        kept = {name: getattr(given, name) for name in ("where", "pitch_mm", "left_out", "understood")}
-        kept |= {"pairs": mended.pairs, "views": mended.views}
-        outcome = replace(outcome, result=result, notes=notes, motions=last, **kept)
+        solved = replace(given, pairs=mended.pairs, views=mended.views)
+        outcome = replace(outcome, given=solved, result=result, notes=notes, motions=last)
     except StcalError as error:
         if given.left_out:
             name, why = given.left_out[0]
             error.append(f"; {len(given.left_out)} left out before, first {name}: {why}")
         raise
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
-
-
-def problem_of(given: HandEyeInput, options: HandEyeOptions) -> HandEyeProblem:
-    return HandEyeProblem(given.pairs, given.setup or "eye-in-hand", given.views, options)
-
-
-def _compared(
-    problem: HandEyeProblem, rows: np.ndarray, workers: int | None, progress: Callable[[int, int], None]
-) -> Outcome:
-    """Returns the results of all methods, and that of the default method as the result."""
-    pairs, views, options = problem.pairs, problem.views, problem.options
-    result = problem.solved().result
-    compared = compare(pairs, problem.setup, views, options, rows=rows, workers=workers, progress=progress)
-    held_out = next(each.held_out for each in compared if each.method == result.method)
-    return Outcome("", held_out.widened(result) if held_out else result, held_out, compared, options)
 
 
 NO_COVARIANCE = Aside(
@@ -155,11 +132,8 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
     problem = problem_of(given, options).mended()
     pairs, views, noise = problem.pairs, problem.views, options.noise
     offset = estimate_offset(pairs, timed.stream, timed.seconds, problem.setup, noise, options.with_scale)
-    rows, outside = np.flatnonzero(offset.kept), np.flatnonzero(~offset.kept)
-    left_out = (
-        *given.left_out,
-        *((pairs.names[i], "outside of the robot's times at the time offset") for i in outside),
-    )
+    rows, why = np.flatnonzero(offset.kept), "outside of the robot's times at the time offset"
+    left_out = (*given.left_out, *((pairs.names[i], why) for i in np.flatnonzero(~offset.kept)))
     lines, views = (*given.understood, *problem.notes), None if views is None else views[rows]
     pairs = replace(pairs[rows], base_from_flange=offset.base_from_flange)
     given = replace(given, pairs=pairs, views=views, symmetries=(), left_out=left_out, understood=lines)

@@ -20,13 +20,8 @@ from tests.levels import FULL
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated, simulated_views
 
-
-@pytest.fixture
-def pairs():
-    return TRUTH.pairs
-
-
 TRUTH = simulated(np.random.default_rng(7), 8, **NOISE)
+PAIRS = TRUTH.pairs
 
 
 def metres(poses: Poses) -> np.ndarray:
@@ -35,12 +30,12 @@ def metres(poses: Poses) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [None, pytest.param("pose", marks=FULL)])
-def test_the_answer_is_that_of_the_command(command, pairs, method, tmp_path):
+def test_the_answer_is_that_of_the_command(command, method, tmp_path):
     """To the last digits of the file: result, method and σ, which poses held out widen here."""
     out = tmp_path / "result.json"
     words = ["--method", method] if method else []
     assert command(poses_file(tmp_path / "poses.csv", TRUTH), "--out", out, *words)[0] == 0
-    said, found = json.loads(out.read_text()), handeye.handeye(pairs, method=method)
+    said, found = json.loads(out.read_text()), handeye.handeye(PAIRS, method=method)
     assert said["method"] == found.method
     np.testing.assert_allclose(said["flange_from_camera"], found.mount_from_camera.matrix(), atol=1e-6)
     np.testing.assert_allclose(said["covariance"], found.covariance, rtol=1e-3)
@@ -49,36 +44,36 @@ def test_the_answer_is_that_of_the_command(command, pairs, method, tmp_path):
 
 
 @pytest.mark.slow
-def test_results_without_some_poses_widen_sigma(pairs):
+def test_results_without_some_poses_widen_sigma():
     """Of eight poses they scatter by more than the adjustment's own σ; the size may be solved for too."""
     options = handeye.HandEyeOptions(with_scale=True)
-    own = handeye.compare(pairs, methods=("pose",), options=options, rows=handeye.splits(8, None, 2))[0].result
+    own = handeye.compare(PAIRS, methods=("pose",), options=options, rows=handeye.splits(8, None, 2))[0].result
     with fails_with("E-HANDEYE-NOT-JUDGED … pose alone"):
         print(own.verdict)
-    scaled = handeye.handeye(pairs, method="pose", options=options)
+    scaled = handeye.handeye(PAIRS, method="pose", options=options)
     assert scaled.covariance[3, 3] > 1.05 * own.covariance[3, 3]
     assert scaled.sigma_scale > 0
 
 
 @pytest.mark.slow
-def test_matrices_in_metres_are_pairs_of_poses(pairs):
-    sides = {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}
+def test_matrices_in_metres_are_pairs_of_poses():
+    sides = {"base_from_flange": PAIRS.base_from_flange, "camera_from_board": PAIRS.camera_from_board}
     found = handeye.handeye(**{name: metres(poses) for name, poses in sides.items()}, unit="m", method="shah")
-    same = handeye.handeye(pairs=pairs, setup="eye-in-hand", method="shah")
+    same = handeye.handeye(pairs=PAIRS, setup="eye-in-hand", method="shah")
     np.testing.assert_allclose(found.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
     off = found.mount_from_camera.translation - FLANGE_FROM_CAMERA.translation
     assert np.linalg.norm(off) < 1.0  # noise of 0.2 mm an axis
-    mixed = handeye.handeye(**sides | {"camera_from_board": pairs.camera_from_board.matrix()}, method="shah")
+    mixed = handeye.handeye(**sides | {"camera_from_board": PAIRS.camera_from_board.matrix()}, method="shah")
     np.testing.assert_allclose(mixed.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
 
 
-def test_what_is_no_pairs_of_poses_is_refused(pairs):
-    flange, board = pairs.base_from_flange, pairs.camera_from_board
+def test_what_is_no_pairs_of_poses_is_refused():
+    flange, board = PAIRS.base_from_flange, PAIRS.camera_from_board
     refuses("E-POSES-COUNT … camera_from_board", handeye.handeye, base_from_flange=flange, setup="eye-in-hand")
-    refuses("E-OPTION-CONFLICT … no unit", handeye.handeye, pairs, unit="m")
-    refuses("E-OPTION-CONFLICT … no matrices", handeye.handeye, pairs, camera_from_board=board)
+    refuses("E-OPTION-CONFLICT … no unit", handeye.handeye, PAIRS, unit="m")
+    refuses("E-OPTION-CONFLICT … no matrices", handeye.handeye, PAIRS, camera_from_board=board)
     refuses("E-FIELD-TYPE … HandEyePoses", handeye.handeye, flange.matrix(), board.matrix())
-    refuses("E-ARGUMENT-UNNAMED … setup=", handeye.handeye, pairs, "eye-in-hand")
+    refuses("E-ARGUMENT-UNNAMED … setup=", handeye.handeye, PAIRS, "eye-in-hand")
     with fails_with("E-OPTION-VALUE … unit 'feet'"):
         handeye.handeye(base_from_flange=flange, camera_from_board=board, unit="feet")
 

@@ -7,13 +7,9 @@ from stcal.handeye import METHODS
 from tests.scripts import load_script
 
 
-@pytest.fixture(scope="module")
-def study():
-    return load_script("reproduce_handeye")
-
-
 @pytest.mark.slow
-def test_a_seed(study, capsys):
+def test_a_seed(capsys):
+    study = load_script("reproduce_handeye")
     found = study.trial(3)
     for method in METHODS:
         motions, (mm, rad) = found[method]

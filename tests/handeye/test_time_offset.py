@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from tests.handeye.photographed import BOARD
-from tests.handeye.written import table
+from tests.handeye.test_cli import in_sigmas
+from tests.handeye.written import table, trajectory, two
 from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.support.handeye import handeye, squared
 from tests.support.handeye_stream import StreamTruth, simulated_stream
@@ -62,31 +62,13 @@ def test_what_does_not_do_is_said():
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
 
 
-def tum(path: Path, times: np.ndarray, poses: Poses) -> Path:
-    rows = []
-    for time, pose, (w, x, y, z) in zip(times, poses, poses.quaternions(), strict=True):
-        place = " ".join(f"{v / 1000:.9f}" for v in pose.translation)
-        rows.append(f"{1700000000 + time:.6f} {place} {x:.12f} {y:.12f} {z:.12f} {w:.12f}")
-    path.write_text("\n".join(rows) + "\n")
-    return path
-
-
-def two_files(folder: Path, truth: StreamTruth, late: float = 0.0) -> list:
-    """``late`` : s that the camera's times are later than they are."""
-    robot = tum(folder / "robot.txt", truth.stream.seconds, truth.stream.base_from_flange)
-    camera = tum(folder / "camera.txt", truth.seconds + late, truth.pairs.camera_from_board)
-    return ["--a", robot, "--b", camera, "--poses-are", "base_from_flange", "--poses-are", "camera_from_board"]
-
-
-def off(data: dict, truth: StreamTruth) -> np.ndarray:
-    found = Poses.of([Rigid.from_matrix(data["flange_from_camera"])])
-    return found.difference(Poses.of([truth.mount_from_camera]))[0]
-
-
 @pytest.mark.slow
 def test_the_offset_is_found_and_used(command, tmp_path):
     truth = simulated_stream(np.random.default_rng(7), 10)
-    files = two_files(tmp_path, truth)
+    times = [[f"{1700000000 + time:.6f}" for time in each] for each in (truth.stream.seconds, truth.seconds)]
+    sides = truth.stream.base_from_flange, truth.pairs.camera_from_board
+    files = two(tmp_path, *(trajectory(*each) for each in zip(times, sides, strict=True)))
+    files += ["--poses-are", "base_from_flange", "--poses-are", "camera_from_board"]
     out = tmp_path / "h.json"
     code, shown, error = command(*files, "--time-offset", "--splits", 0, "--method", "pose", "--out", out)
     assert code == 0, error
@@ -95,8 +77,7 @@ def test_the_offset_is_found_and_used(command, tmp_path):
     assert abs(offset["seconds"] - 0.023) < 3 * offset["sigma_s"] < 2e-3
     taken = f"taken at t + {1e3 * offset['seconds']:.2f} ms of the robot's"
     assert all(text in shown for text in ("robot's clock minus camera's: the robot's is ahead of the camera's", taken))
-    wrong = off(found, truth)
-    assert wrong @ np.linalg.solve(np.array(found["covariance"]), wrong) < 22.5  # χ² of 6, once in a thousand
+    assert in_sigmas(found, "flange_from_camera", truth.mount_from_camera) ** 2 < 22.5  # χ² of 6, once in a thousand
     assert found["rms"]["translation_mm"] < 1  # plain, of 23 ms: several mm
     assert "poses by time: 10 times in 1200 samples of robot.txt: 10 interpolated (cubic; samples 0.02 s apart" in shown
 

@@ -133,13 +133,17 @@ def npy(folder: Path, pairs: HandEyePoses) -> Arguments:
     return ["--a", str(folder / "robot.npy"), "--b", str(folder / "camera.npy")]
 
 
+def trajectory(stamps: list[str], poses: Poses) -> str:
+    """The text of a TUM trajectory."""
+    rows = [f"{t} {line([*m[:3, 3], *xyzw(m)])}\n" for t, m in zip(stamps, in_metres(poses), strict=True)]
+    return "# timestamp tx ty tz qx qy qz qw\n" + "".join(rows)
+
+
 def tum(folder: Path, pairs: HandEyePoses) -> Arguments:
     """The camera's trajectory is board_from_camera, and its stamps are written otherwise."""
-    head = "# timestamp tx ty tz qx qy qz qw\n"
-    a = [f"{100.5 + i:.4f} {line([*m[:3, 3], *xyzw(m)])}" for i, m in enumerate(in_metres(pairs.base_from_flange))]
-    inverse = in_metres(pairs.camera_from_board.inverse())
-    b = [f"{100.5 + i:.1f} {line([*m[:3, 3], *xyzw(m)])}" for i, m in enumerate(inverse)]
-    return two(folder, head + "\n".join(a), head + "\n".join(b))
+    a, b = ([f"{100.5 + i:.{digits}f}" for i in range(len(pairs))] for digits in (4, 1))
+    texts = trajectory(a, pairs.base_from_flange), trajectory(b, pairs.camera_from_board.inverse())
+    return two(folder, *texts)
 
 
 def euler_columns(folder: Path, pairs: HandEyePoses) -> Arguments:

@@ -147,10 +147,6 @@ class Said:
         if len({KnownName(name, "").role for name in self.frames}) < len(self.frames):
             raise InputError("E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each side at most")
 
-    def frames_of(self, role: Role) -> str | None:
-        """Returns the transform that poses of this role are stated to be; None where it is not stated."""
-        return next((name for name in self.frames if name in FRAMES[role]), None)
-
 
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> Poses:
     """Returns the poses of homogeneous matrices (m, 4, 4)."""

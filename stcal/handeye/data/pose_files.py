@@ -512,7 +512,7 @@ def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> P
 
 def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> KnownName:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
-    option, frames = statements.frames_of(role), side.frames
+    option, frames = next((name for name in statements.frames if name in FRAMES[role]), None), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
         said = f"{path}: {frames.name} {frames.by}, --poses-are {option}; if the name is wrong, change it in the file"
         name = inverse_name(frames.by.rpartition(" ")[2])

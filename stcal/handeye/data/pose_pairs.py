@@ -314,6 +314,10 @@ class Loop:
         """Returns residuals (m, 6) of the chains against ``stand_from_board``: rad, mm at its origin; stand axes."""
         return self.chain(mount_from_camera, scale).difference(Poses.of([stand_from_board] * len(self)))
 
+    def misses(self, mount_from_camera: Rigid, stand_from_board: Rigid, scale: float = 1.0) -> np.ndarray:
+        """Returns the lengths (m, 2) of :meth:`residuals`: rad, mm."""
+        return np.linalg.norm(self.residuals(mount_from_camera, stand_from_board, scale).reshape(-1, 2, 3), axis=2)
+
     def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0, count: int = 12) -> np.ndarray:
         """Returns the derivative (m, 6, 12 or 13) of :meth:`residuals` by left perturbations of X and Z, and by the
         scale; that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""

@@ -153,10 +153,6 @@ class PoseSolution:
     settled: bool
 
     @property
-    def estimated(self) -> tuple[str, ...]:
-        return tuple(self.sigma)
-
-    @property
     def inverse(self) -> np.ndarray:
         """Covariance (k, k) of X, Z (and the scale), of independent errors of the poses."""
         return generalised_inverse(self.normal)

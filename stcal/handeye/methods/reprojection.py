@@ -351,13 +351,13 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, kno
 class AdjustedCorners:
     """An adjustment of corners.
 
-    ``loop``, ``views`` : all; ``used`` : (m,) which of them were used; ``corners`` : problem of these, ``solution`` :
-    its solution; ``inverse`` : covariance of its kept unknowns; ``settled`` : whether σ settled.
+    ``loop``, ``views`` : all; ``outliers`` : (m,); ``corners`` : problem of the others, ``solution`` : its solution;
+    ``inverse`` : covariance of its kept unknowns; ``settled`` : whether σ settled.
     """
 
     loop: Loop
     views: Views
-    used: np.ndarray
+    outliers: np.ndarray
     corners: Corners
     solution: Solution
     inverse: np.ndarray
@@ -368,22 +368,14 @@ class AdjustedCorners:
         return self.corners.bundle(self.solution.values)
 
     @property
-    def estimated(self) -> tuple[str, ...]:
-        return self.corners.free
-
-    @property
     def sigma(self) -> dict[str, float]:
         """The σ by kind that are not 0."""
         return {name: float(value) for name, value in self.corners.sigma.items() if value}
 
-    @property
-    def outliers(self) -> np.ndarray:
-        return ~self.used
-
     @cached_property
     def found(self) -> Reprojection:
         state, corners, at = self.state, self.corners, self.solution.places.get("camera")
-        true, rows = list(self.loop.base_from_flange), np.flatnonzero(self.used)
+        true, rows = list(self.loop.base_from_flange), np.flatnonzero(~self.outliers)
         for row, pose in zip(rows, state.base_from_flange, strict=True):
             true[row] = pose
         covariance, seen = None if at is None else self.inverse[at, at], (rows[corners.view], corners.corner)
@@ -407,7 +399,7 @@ class AdjustedCorners:
         """Returns the covariance (12, 12) of X and Z with the errors of the intrinsics as filed, which are *considered*
         (Schmidt 1966; Bierman 1977, ch. VIII): their ``prior`` covariance is carried through. Estimated σ, too large by
         the camera's error, are estimated again with them, linear about the state. ``inverse`` : without them."""
-        free, (wider, linear) = self.estimated, self._with_lens(*lens_of(prior))
+        free, (wider, linear) = self.corners.free, self._with_lens(*lens_of(prior))
         sigma = wider.sigma | estimated(wider, linear)
         again = replace(wider, sigma=sigma).problem().at(linear.values)
         covariance = generalised_inverse(again.normal)
@@ -442,7 +434,7 @@ class AdjustedCorners:
     def without(self, out: np.ndarray) -> Bundle:
         """Returns the solution without the poses ``out``, rows among all: by steps from the solution of all, with its
         σ. The error of such a step is of second order in a small change (influence: Cook & Weisberg 1982)."""
-        keep = ~np.isin(np.flatnonzero(self.used), out)
+        keep = ~np.isin(np.flatnonzero(~self.outliers), out)
         corners, values = self.corners.only(keep), dict(self.solution.values)
         if "robot" in values:
             values["robot"] = values["robot"][keep]
@@ -481,7 +473,7 @@ def adjust_views(
             break
         used[rows[bad]] = False
         good -= int(bad.sum())
-    return AdjustedCorners(loop, views, used, corners, solution, inverse, settled)
+    return AdjustedCorners(loop, views, ~used, corners, solution, inverse, settled)
 
 
 def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> np.ndarray:
@@ -501,6 +493,6 @@ def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> 
 
 def _near(loop: Loop, first: LoopState) -> np.ndarray:
     """Returns which poses (m,) are not wrong from the start."""
-    miss = loop.residuals(*first)
-    far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
-    return ~(far | (np.linalg.norm(miss[:, :3], axis=1) > GROSS_RAD))
+    turn, shift = loop.misses(*first).T
+    far = GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
+    return ~((shift > far) | (turn > GROSS_RAD))

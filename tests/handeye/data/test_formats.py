@@ -61,23 +61,13 @@ def test_other_formats_are_refused_in_a_line(name, tmp_path):
         assert str(path) in message
 
 
-def test_two_rows_of_one_image_are_said(tmp_path):
-    row = "0.1,0.2,0.3,1,0,0,0"
-    header = "image," + ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
-    (tmp_path / "poses.csv").write_text(f"{header}\n0.png,{row}\ng/0.png,{row}\n")
-    found = read_robot(tmp_path / "poses.csv", Said())
+def test_names_of_rows_are_those_of_images(tmp_path):
+    """Without folder and ending too, where that leaves one image and one row."""
+    columns = ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
+    row = "0.png,0.1,0.2,0.3,1,0,0,0\n"
+    (tmp_path / "poses.csv").write_text(f"image,{columns}\n{row}g/{row}")
     with fails_with("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'"):
-        rows_of_images(found, ["g/0.png"])
-
-
-def test_quaternions_in_the_order_of_their_columns(tmp_path):
-    head = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
-    (tmp_path / "r.csv").write_text(f"image,{head}\na.png,1,2,3,0,0.8,0,0.6\n")
-    found = read_robot(tmp_path / "r.csv", Said(), "xyzw").poses
-    assert found.rotation[0] == pytest.approx(np.array([[-0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, -0.28]]))
-
-
-def test_names_without_folder_and_ending(tmp_path):
+        rows_of_images(read_robot(tmp_path / "poses.csv", Said()), ["g/0.png"])
     np.savez(tmp_path / "r.npz", base_from_flange=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
     found = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
     assert rows_of_images(found, ["a/0.png", "a/10.png", "a/7.png"]) == ({"a/0.png": 0, "a/10.png": 2}, ("1",), "")
@@ -85,39 +75,43 @@ def test_names_without_folder_and_ending(tmp_path):
         rows_of_images(found, ["a/1.png", "b/1.png"])
 
 
-def test_a_recording_of_rtde_is_read(tmp_path):
-    """Metres, and rotation vectors in radians."""
-    names = " ".join(f"actual_TCP_pose_{i}" for i in range(6))
-    values = "\n".join(f"{i}.008 0.{i}1 -0.2 0.3 0 0 0.5" for i in range(3))
-    (tmp_path / "r.csv").write_text(f"timestamp {names}\n{values}\n")
-    found = read_robot(tmp_path / "r.csv", Said())
-    assert found.names == ("0.008", "1.008", "2.008")
-    assert found.poses.translation[2] == pytest.approx([210, -200, 300])
-    assert found.poses.rotation[0, 0] == pytest.approx([np.cos(0.5), -np.sin(0.5), 0])
+OWN = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
+RTDE = "timestamp " + " ".join(f"actual_TCP_pose_{i}" for i in range(6))
+VINS = "".join(f"14036365797635558{i:02},0.1,0.2,0.{i},0.8,0.0,0.0,0.6\n" for i in range(3))
+"""Of w first and no header, where TUM's files have seconds and w last."""
 
 
-def test_an_index_without_a_name_names_rows(tmp_path):
-    (tmp_path / "p.csv").write_text(",x,y,z,qx,qy,qz,qw\n0,0.1,0.2,0.3,0,0,0.6,0.8\n1,0.2,0.2,0.3,0,0,0.6,0.8\n")
-    found = read_robot(tmp_path / "p.csv", Said())
-    assert found.names == ("0", "1")
-    assert found.poses.translation[0] == pytest.approx([100, 200, 300])
+@pytest.mark.parametrize(
+    ("text", "rotation", "order", "names", "place", "turned"),
+    [
+        (f"image,{OWN}\na.png,1,2,3,0,0.8,0,0.6\n", None, "xyzw", ("a.png",), [1, 2, 3], {(0, 2): 0.96, (1, 1): 1}),
+        (f"{RTDE}\n0.008 0.21 -0.2 0.3 0 0 0.5\n", None, "wxyz", ("0.008",), [210, -200, 300], {(1, 0): np.sin(0.5)}),
+        (",x,y,z,qx,qy,qz,qw\n0,0.1,0.2,0.3,0,0,0.6,0.8\n", None, "wxyz", ("0",), [100, 200, 300], {(1, 0): 0.96}),
+        (VINS, "wxyz", "wxyz", None, [100, 200, 0], {(1, 0): 0.96}),
+        (VINS, "xyzw", "wxyz", None, [100, 200, 0], {(2, 1): 0.96}),
+    ],
+)
+def test_tables_of_other_programs_are_read(tmp_path, text, rotation, order, names, place, turned):
+    """By the order of columns, a recording of UR's RTDE, an index without a name, and VINS, by either order."""
+    (tmp_path / "r.csv").write_text(text)
+    found = read_robot(tmp_path / "r.csv", Said(rotation=rotation), order)
+    assert found.names == (names or found.names)
+    assert found.poses.translation[0] == pytest.approx(place)
+    for at, value in turned.items():
+        assert found.poses.rotation[0][at] == pytest.approx(value)
 
 
-def test_quaternions_after_nanoseconds_have_an_open_order(tmp_path):
-    """VINS writes w first and no header, where TUM's files have seconds and w last."""
-    path = tmp_path / "vio.csv"
-    path.write_text("".join(f"14036365797635558{i:02},0.1,0.2,0.{i},0.8,0.0,0.0,0.6\n" for i in range(3)))
-    with fails_with("E-ROTATION-AMBIGUOUS … vio.csv … wxyz or xyzw"):
-        read_robot(path, Said())
-    for order, place in (("wxyz", (1, 0)), ("xyzw", (2, 1))):  # sin of the turn about Z, about X
-        found = read_robot(path, Said(rotation=order)).poses.rotation[0]
-        assert found[place] == pytest.approx(0.96)
-
-
-def test_more_than_a_turn_in_radians_is_refused(tmp_path):
-    (tmp_path / "p.csv").write_text("X,Y,Z,Rx,Ry,Rz\n100,200,300,10,20,30\n110,200,300,-10,20,35\n")
-    with fails_with("E-ANGLE-UNIT … 35 … rotvec-deg"):
-        read_robot(tmp_path / "p.csv", Said(rotation="ur-rotvec"))
+@pytest.mark.parametrize(
+    ("text", "said", "error"),
+    [
+        (VINS, Said(), "E-ROTATION-AMBIGUOUS … r.csv … wxyz or xyzw"),
+        ("X,Y,Z,Rx,Ry,Rz\n100,200,300,10,20,35\n", Said(rotation="ur-rotvec"), "E-ANGLE-UNIT … 35 … rotvec-deg"),
+    ],
+)
+def test_rotations_that_cannot_be_told_are_refused(tmp_path, text, said, error):
+    (tmp_path / "r.csv").write_text(text)
+    with fails_with(error):
+        read_robot(tmp_path / "r.csv", said)
 
 
 QUICK = ("--method", "pose", "--splits", 0)

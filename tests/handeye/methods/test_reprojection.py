@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
 from stcal.handeye.data.pose_pairs import SETUPS, Loop, LoopState
-from stcal.handeye.methods.reprojection import problem
+from stcal.handeye.methods.reprojection import Corners
 from stcal.io.cameras.camera_model import CameraPrior, camera_prior
 from tests.outcome import refuses
 from tests.support.handeye import CAMERA, error, handeye, normalised, simulated_views, squared
@@ -27,7 +27,7 @@ def test_derivatives_of_the_corners(setup):
     truth = simulated_views(np.random.default_rng(5), 4, setup)
     loop = Loop.of(truth.pairs, setup)
     noise = Noise(1e-3, 0.5, corner_px=0.2, board_mm=0.1)
-    corners, _ = problem(loop, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
+    corners = Corners.of(loop, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
     adjustment = corners.problem()
     values = corners.start(LoopState(truth.mount_from_camera, truth.stand_from_board))
     kinds = {kind for factor in adjustment.factors for kind in factor.kinds}

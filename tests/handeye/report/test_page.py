@@ -12,6 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
+from stcal.handeye.data.pose_files import HandEyeInput
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import by_robot, outcome_report
 from stcal.handeye.handeye_pipeline import Outcome
@@ -29,15 +30,10 @@ def of_views() -> Outcome:
     result = handeye(truth.pairs, truth.setup, None, truth.views, options)
     result = replace(result, notes=("a note with <markup> & more",))
     held_out = cross_validate(truth.pairs, truth.setup, None, truth.views, options, splits(10, 2, 2))
-    return Outcome(
-        "images & poses",
-        result,
-        held_out,
-        pitch_mm=25.0,
-        left_out=(("x<1>.png", "no board"),),
-        pairs=truth.pairs,
-        views=truth.views,
+    given = HandEyeInput(
+        "images & poses", truth.pairs, truth.views, pitch_mm=25.0, left_out=(("x<1>.png", "no board"),)
     )
+    return Outcome(given, result, held_out)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +41,8 @@ def of_methods() -> Outcome:
     truth = simulated(np.random.default_rng(3), 10, robot=(2e-4, 0.1), camera=(5e-4, 0.2))
     compared = compare(truth.pairs, methods=("tsai-lenz", "pose"), rows=splits(10, 2, 2))
     failed = Compared("zhao", None, None, "hand-eye: zhao finds no rotation")
-    return Outcome("poses.csv", compared[1].result, compared[1].held_out, (*compared, failed), pairs=truth.pairs)
+    given = HandEyeInput("poses.csv", truth.pairs)
+    return Outcome(given, compared[1].result, compared[1].held_out, (*compared, failed))
 
 
 @pytest.mark.slow
@@ -75,7 +72,8 @@ def test_every_sigma_that_there_is_has_a_name():
         HandEyeOptions(intrinsics=camera_prior(Camera.of(wrong, "PINHOLE"))),
         Views(wrong, truth.views.views),
     )
-    outcome = Outcome("images", handeye(truth.pairs, truth.setup, None, views, options), options=options)
+    result = handeye(truth.pairs, truth.setup, None, views, options)
+    outcome = Outcome(HandEyeInput("images", truth.pairs, views), result, options=options)
     assert "camera file, focal length" in outcome_report(outcome).text()
     assert "Camera, as adjusted" in outcome_report(outcome).page()
     assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5
@@ -116,4 +114,4 @@ def test_a_board_behind_the_camera_is_nowhere(truth, method):
     result = handeye(truth.pairs, truth.setup, method, truth.views, HandEyeOptions(with_scale=True))
     behind = replace(result, stand_from_board=Rigid(translation=[0, 0, 1e5]) @ result.stand_from_board)
     assert any(np.isnan(px).any() for px in by_robot(behind, truth.pairs, truth.views))
-    assert outcome_report(Outcome("images", behind, pairs=truth.pairs, views=truth.views)).page()
+    assert outcome_report(Outcome(HandEyeInput("images", truth.pairs, truth.views), behind)).page()

@@ -8,6 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
+from stcal.handeye.data.pose_files import HandEyeInput
 from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.remarks import Aside, Grave
 from stcal.handeye.validate import cross_validate, splits
@@ -22,7 +23,7 @@ def outcome_of(count: int, seed: int, method: str = "pose", pairs=None, **noise)
     pairs = pairs or truth.pairs
     result = handeye(pairs, truth.setup, method)
     held_out = cross_validate(pairs, truth.setup, method, None, HandEyeOptions(), splits(count, None, 6))
-    return Outcome("poses.csv", result, held_out, pairs=pairs)
+    return Outcome(HandEyeInput("poses.csv", pairs), result, held_out)
 
 
 def word_of(outcome: Outcome, title: str) -> str:
@@ -53,12 +54,12 @@ def test_few_poses_ask_for_care():
 def test_small_turns_are_named_with_the_axes_to_turn_about():
     """Turns of 2°: the camera's place is known ten times worse than a pose."""
     outcome = outcome_of(16, 5)
-    base = outcome.pairs.base_from_flange
+    base = outcome.given.pairs.base_from_flange
     small = Poses.of(Rigid.exp(np.append(0.04 * pose.log()[:3], pose.translation)) for pose in base)
     result, rng = outcome.result, np.random.default_rng(1)
     errors = [Rigid.exp([*rng.normal(0, 1e-4, 3), *rng.normal(0, 0.05, 3)]) for _ in range(16)]
     seen = result.mount_from_camera.inverse() @ (small.inverse() @ result.stand_from_board)
-    pairs = replace(outcome.pairs, base_from_flange=small, camera_from_board=Poses.of(errors) @ seen)
+    pairs = replace(outcome.given.pairs, base_from_flange=small, camera_from_board=Poses.of(errors) @ seen)
     found = judged(outcome_of(16, 5, pairs=pairs))
     (motions,) = [each for each in found.findings if each.title == "Motions of the flange"]
     assert motions.word == "do not use"
