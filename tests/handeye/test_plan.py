@@ -135,12 +135,12 @@ def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(plan, taken):
 
 @pytest.mark.slow
 def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
-    """The limit is halfway between the first and second value of the first joint."""
+    """The limit is halfway between the second and third value of the first joint."""
     poses, robot_file = taken
     arm = mh80()
     first = np.sort(inverse(arm, TAKEN.pairs.base_from_flange).q[:, 0])
     assert (np.abs(first) < np.radians(60)).all()  # so that turned round the robot would have to bend over backwards
-    limited = Joint("revolute", float(first[:2].mean()), np.radians(60))
+    limited = Joint("revolute", float(first[1:3].mean()), np.radians(60))
     save_robot(robot_file, replace(arm, joints=(limited, *arm.joints[1:])))
     code, shown, _ = plan(poses, "--robot", robot_file, "--count", 1)
     assert code == 0
