@@ -67,7 +67,7 @@ def test_small_turns_are_named_with_the_axes_to_turn_about():
     assert found.word == "do not use"
 
 
-def test_errors_on_poses_held_out_decide():
+def test_errors_on_poses_held_out_and_outliers_decide():
     """Errors of poses held out, four times as large: less than one of 100 000 by chance."""
     outcome = outcome_of(16, 5)
     assert word_of(outcome, "Poses held out") == "good"
@@ -75,12 +75,8 @@ def test_errors_on_poses_held_out_decide():
     for factor, word in ((1.9, "use with care"), (4.0, "do not use")):
         worse = replace(held, translation_mm=factor * held.translation_mm)
         assert word_of(replace(outcome, held_out=worse), "Poses held out") == word
-    outcome = replace(outcome_of(16, 5), held_out=None)
-    assert judged(outcome).sentence() == "use with care: errors on poses held out are not known"
-
-
-def test_outliers():
-    outcome = outcome_of(16, 5)
+    unknown = replace(outcome, held_out=None)
+    assert judged(unknown).sentence() == "use with care: errors on poses held out are not known"
     for count, word in ((1, "use with care"), (4, "use with care"), (5, "do not use")):
         bad = np.arange(16) < count
         assert word_of(replace(outcome, result=replace(outcome.result, outliers=bad)), "Outliers") == word
