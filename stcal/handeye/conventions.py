@@ -16,8 +16,7 @@ from stcal.explain import Candidate, explain
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_content import FRAMES
-from stcal.handeye.data.pose_pairs import OTHER, HandEyePoses, Loop, LoopState, Setup, carried
+from stcal.handeye.data.pose_pairs import OTHER, SIDES, HandEyePoses, Loop, LoopState, Setup, carried
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.handeye.remarks import HALL_MM, Grave, Remarks
@@ -33,7 +32,7 @@ LOST = 0.25
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
-SIDES = (("robot", "robot"), ("board", "camera"))  # what messages and options call the two sides
+CALLED = (("robot", "robot"), ("board", "camera"))  # what messages and options call the two sides
 Guess = Callable[[Loop, bool], LoopState]
 
 
@@ -96,7 +95,7 @@ def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale:
             raise InputError("E-HANDEYE-CONVENTION", said)
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
-        robot, camera = (" in place of ".join(names) for names in FRAMES.values())
+        robot, camera = (" in place of ".join(names) for names in SIDES.values())
         said = "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
         said += f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or, if the "
         said += "camera stood beside the robot, the camera's side alone, with --setup eye-to-hand; or the camera's "
@@ -118,7 +117,7 @@ by the names that --rotation has for them; the most frequent first."""
 def _readings(loop: Loop, by_images: bool, turns_agree: bool) -> Iterator[Candidate]:
     """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
     yield from _variants(loop, by_images)
-    for side, role in SIDES[: 1 if by_images else 2]:
+    for side, role in CALLED[: 1 if by_images else 2]:
         for one, other in permutations(ANGLES, 2):
             words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad), or by the names of its "
             words += f"columns, if they were read as {one}"
@@ -161,7 +160,7 @@ def _inverted(loop: Loop, by_images: bool) -> Candidate:
     """Returns the loop with one side inverted. As a board is in front of its camera, that side is known unless the
     poses have the board in front in both directions."""
     seen = loop.camera_from_board
-    robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
+    robot, camera = SIDES["robot"][1], SIDES["camera"][1]
     front, front_inverted = (bool((poses.translation[:, 2] > 0).all()) for poses in (seen, seen.inverse()))
     named = f"{camera} or {robot}"
     if by_images:
@@ -181,7 +180,7 @@ def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
     hand, eye = loop.base_from_flange, loop.camera_from_board
     yield _inverted(loop, by_images)
     # Residuals show only the ratio of two units; lengths beyond a hall tell which side it is.
-    for (side, _), (other, role) in (SIDES, SIDES[::-1]):
+    for (side, _), (other, role) in (CALLED, CALLED[::-1]):
         factor, which, times = 1000.0, side, "times"
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
@@ -207,7 +206,7 @@ def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
     for reading in (*ORDERS, CONJUGATED):
         quaternions = f"quaternions {'conjugated' if reading.conjugated else 'in another order'}: if {reading.held}"
         order = "xyzw" if reading is LAST else "wxyz"
-        for side, role in SIDES[: 1 if by_images else 2]:
+        for side, role in CALLED[: 1 if by_images else 2]:
             remedy = f"name the columns so; for a file without names of columns give --rotation {role}={order}"
             remedy = reading.remedy if reading.conjugated or by_images else remedy
             yield Candidate(f"with the {side}'s {quaternions}, {remedy}", _changed(loop, reading.poses, side))

@@ -15,17 +15,13 @@ from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
 from stcal.workflows.handeye_inputs import HandEyeInput
 from tests.handeye.test_cli import NOISE
-from tests.handeye.written import poses_file, table
+from tests.handeye.written import in_metres, poses_file, sides_of, table
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated, simulated_views
 
 TRUTH = simulated(np.random.default_rng(7), 8, **NOISE)
 PAIRS = TRUTH.pairs
-
-
-def metres(poses: Poses) -> np.ndarray:
-    return poses.matrix() * np.array([[1, 1, 1, 1e-3]] * 3 + [[1, 1, 1, 1]])
 
 
 @pytest.mark.slow
@@ -57,8 +53,8 @@ def test_results_without_some_poses_widen_sigma():
 
 @pytest.mark.slow
 def test_matrices_in_metres_are_pairs_of_poses():
-    sides = {"base_from_flange": PAIRS.base_from_flange, "camera_from_board": PAIRS.camera_from_board}
-    found = handeye.handeye(**{name: metres(poses) for name, poses in sides.items()}, unit="m", method="shah")
+    sides = sides_of(PAIRS)
+    found = handeye.handeye(**{name: in_metres(poses) for name, poses in sides.items()}, unit="m", method="shah")
     same = handeye.handeye(pairs=PAIRS, setup="eye-in-hand", method="shah")
     np.testing.assert_allclose(found.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
     off = found.mount_from_camera.translation - FLANGE_FROM_CAMERA.translation

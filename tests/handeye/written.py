@@ -40,14 +40,15 @@ def sides_of(pairs: HandEyePoses) -> dict[str, Poses]:
     return {"base_from_flange": pairs.base_from_flange, "camera_from_board": pairs.camera_from_board}
 
 
-def matrices(poses) -> np.ndarray:
-    return np.array([pose.matrix() for pose in poses])
+def in_metres(poses: Poses) -> np.ndarray:
+    return poses.matrix() * np.vstack([[[1, 1, 1, 1e-3]] * 3, [1] * 4])
 
 
-def in_metres(poses) -> np.ndarray:
-    found = matrices(poses)
-    found[:, :3, 3] /= 1000
-    return found
+def saved(folder: Path, pairs: HandEyePoses, metres: bool = True) -> str:
+    """The board's poses as 4×4 matrices in a file."""
+    path, poses = folder / "camera.npy", pairs.camera_from_board
+    np.save(path, in_metres(poses) if metres else poses.matrix())
+    return str(path)
 
 
 def xyzw(matrix: np.ndarray) -> list[float]:
@@ -65,14 +66,9 @@ def message(matrix: np.ndarray) -> dict:
 
 
 def opencv_arrays(folder: Path, pairs: HandEyePoses) -> Arguments:
-    a, b = matrices(pairs.base_from_flange), matrices(pairs.camera_from_board)
-    np.savez(
-        folder / "pairs.npz",
-        R_gripper2base=a[:, :3, :3],
-        t_gripper2base=a[:, :3, 3:],
-        R_target2cam=b[:, :3, :3],
-        t_target2cam=b[:, :3, 3:],
-    )
+    sides = {"gripper2base": pairs.base_from_flange, "target2cam": pairs.camera_from_board}
+    turns = {f"R_{name}": poses.rotation for name, poses in sides.items()}
+    np.savez(folder / "pairs.npz", **turns, **{f"t_{n}": poses.translation[:, :, None] for n, poses in sides.items()})
     return [str(folder / "pairs.npz")]
 
 
@@ -85,11 +81,8 @@ def stacks(folder: Path, pairs: HandEyePoses) -> Arguments:
 
 
 def objects(folder: Path, pairs: HandEyePoses) -> Arguments:
-    both = zip(matrices(pairs.base_from_flange), matrices(pairs.camera_from_board), strict=True)
-    rows = [
-        {"image": f"{i}.png", "base_from_flange": a.tolist(), "camera_from_board": b.tolist()}
-        for i, (a, b) in enumerate(both)
-    ]
+    sides = {name: poses.matrix().tolist() for name, poses in sides_of(pairs).items()}
+    rows = [{"image": f"{i}.png", **{n: side[i] for n, side in sides.items()}} for i in range(len(pairs))]
     (folder / "pairs.json").write_text(json.dumps(rows))
     return [str(folder / "pairs.json")]
 
@@ -128,9 +121,8 @@ def two(folder: Path, a: str | bytes, b: str | bytes, suffix: str = "txt") -> Ar
 
 
 def npy(folder: Path, pairs: HandEyePoses) -> Arguments:
-    for name, poses in (("robot", pairs.base_from_flange), ("camera", pairs.camera_from_board)):
-        np.save(folder / f"{name}.npy", in_metres(poses))
-    return ["--a", str(folder / "robot.npy"), "--b", str(folder / "camera.npy")]
+    np.save(folder / "robot.npy", in_metres(pairs.base_from_flange))
+    return ["--a", str(folder / "robot.npy"), "--b", saved(folder, pairs)]
 
 
 def trajectory(stamps: list[str], poses: Poses) -> str:
@@ -171,8 +163,8 @@ def robots(name: str, order: str, columns: tuple[str, str, str], unit: str = "")
         table = np.hstack([pairs.base_from_flange.translation, named])
         head = ",".join(["x_mm", "y_mm", "z_mm", *(f"{c}_{unit}" if unit else c for c in columns)])
         (folder / "robot.csv").write_text("\n".join([head, *(line(row, ",") for row in table)]) + "\n")
-        np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
-        return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.npy"), "--rotation", f"robot={name}"]
+        camera = saved(folder, pairs, metres=False)
+        return ["--a", str(folder / "robot.csv"), "--b", camera, "--rotation", f"robot={name}"]
 
     return write
 
@@ -182,14 +174,13 @@ def of_ur(folder: Path, pairs: HandEyePoses) -> Arguments:
     turns = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_rotvec()
     rows = [f"p[{line([*t / 1000, *w], ', ')}]" for t, w in zip(pairs.base_from_flange.translation, turns, strict=True)]
     (folder / "robot.txt").write_text("\n".join(rows))
-    np.save(folder / "camera.npy", in_metres(pairs.camera_from_board))
-    return ["--a", str(folder / "robot.txt"), "--b", str(folder / "camera.npy"), "--rotation", "robot=ur-rotvec"]
+    return ["--a", str(folder / "robot.txt"), "--b", saved(folder, pairs), "--rotation", "robot=ur-rotvec"]
 
 
 def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
     for name, poses in (("robot", pairs.base_from_flange), ("camera", pairs.camera_from_board)):
         storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
-        for i, matrix in enumerate(matrices(poses)):
+        for i, matrix in enumerate(poses.matrix()):
             storage.write(f"image_{i}", matrix)
         storage.release()
     return ["--a", str(folder / "robot.yml"), "--b", str(folder / "camera.yml")]

@@ -4,21 +4,17 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pose_pairs import SIDES, Setup
+from stcal.handeye.data.pose_pairs import SIDES, Role, Setup
 from stcal.io.rotations import of_quaternions, proper, require_finite
 from stcal.io.table import LENGTHS
 
-Role = Literal["robot", "camera"]
-ROLES: tuple[Role, ...] = get_args(Role)
-FRAMES: dict[Role, tuple[str, str]] = dict(zip(ROLES, SIDES, strict=True))
-"""The transform that is needed for each side, and its inverse."""
-EVERY_FRAME = tuple(name for names in SIDES for name in names)
+EVERY_FRAME = tuple(name for names in SIDES.values() for name in names)
 BY_DEFAULT = "by default"
 
 
@@ -34,7 +30,7 @@ class KnownName:
     @property
     def role(self) -> Role:
         """The side that has this transform."""
-        return "robot" if self.name in FRAMES["robot"] else "camera"
+        return "robot" if self.name in SIDES["robot"] else "camera"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,11 +112,11 @@ class Said:
     ) -> "Said":
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``."""
-        own: dict[str, dict[str, str]] = {role: {} for role in ("", *ROLES)}
+        own: dict[str, dict[str, str]] = {role: {} for role in ("", *SIDES)}
         for option, value in (*(("rotation", v) for v in rotation), *(("length_unit", v) for v in length_unit)):
             role, equals, name = value.partition("=") if "=" in value else ("", "", value)
             typed = f"--{option.replace('_', '-')} {value}"
-            if equals and role not in ROLES:
+            if equals and role not in SIDES:
                 raise InputError("E-OPTION-VALUE", f"{typed}: robot= or camera= needed before the name")
             if option in own[role]:
                 raise InputError("E-OPTION-REPEATED", f"{typed}: given twice; one for each of robot and camera")
@@ -208,7 +204,7 @@ def frames_of(key: object) -> KnownName | None:
             if frames in EVERY_FRAME:
                 return KnownName(frames, f"by its name {key}", only)
     role = next((role for role, names in ROLES_BY_NAME.items() if names.fullmatch(name)), None)
-    return KnownName(FRAMES[role][0], BY_DEFAULT, False) if role else None
+    return KnownName(SIDES[role][0], BY_DEFAULT, False) if role else None
 
 
 def inverse_name(key: str) -> str:
@@ -349,7 +345,7 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent |
     fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
     by = "as easy_handeye writes it"
-    frames = KnownName(FRAMES["robot"][fixed], f"{by} of {of_setup}", False), KnownName("camera_from_board", by, False)
+    frames = KnownName(SIDES["robot"][fixed], f"{by} of {of_setup}", False), KnownName("camera_from_board", by, False)
     sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
     return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
 

@@ -20,17 +20,15 @@ from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_content import (
     EVERY_FRAME,
-    FRAMES,
     KnownName,
     PoseContent,
     PoseSide,
-    Role,
     Said,
     inverse_name,
     read_tree,
     require_each_once,
 )
-from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Setup, inverted, read_poses, read_side
+from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Role, Setup, inverted, read_poses, read_side
 from stcal.handeye.data.pose_partners import matched
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, taken_at
 from stcal.io.cameras.camera_model import CameraPrior
@@ -357,7 +355,7 @@ def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxy
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
         said = f"{source}: {content.form} with {held}"
         raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
-    robot, camera = (settled(content, role, source, statements) for role in FRAMES)
+    robot, camera = (settled(content, role, source, statements) for role in SIDES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         said = (
             f"{source}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
@@ -381,7 +379,7 @@ def read_two(
     The rows are joined by image or time, or by their order where neither file has names. Where times are not equal,
     and for all rows where ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``.
     """
-    files = tuple(zip(FRAMES, (first, second), keys_of(key), strict=True))
+    files = tuple(zip(SIDES, (first, second), keys_of(key), strict=True))
     contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
     if not any(contents):
         return None
@@ -447,8 +445,8 @@ def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> Pos
     timed = "image" not in table and TIME in table
     names = tuple(table.text(TIME if timed else "image"))
     require_each_once(names, places_of(table), table.where, "image ")
-    poses, covariance, _ = read_side(table, *SIDES[0])
-    frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
+    poses, covariance, _ = read_side(table, *SIDES["robot"])
+    frame = next(name for name in SIDES["robot"] if any(column.startswith(f"{name}_") for column in table.columns))
     understood = f"{path.name}: table; {len(names)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
     read = {"names": names, "covariance": covariance, "where": str(path), "understood": understood, "own": True}
     return PoseSide(poses, places_of(table), "quaternions by name", timed=timed, **read)
@@ -467,7 +465,7 @@ def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
     """Returns lines that describe a table of pose pairs of the package's own."""
     table = read_table(source, "pose file", quaternions)
     content, place = read_columns(table, "image", Said()), Path(table.where.removeprefix("pose file "))
-    return [f"{role}: {settled(content, role, place, Said()).understood}" for role in FRAMES] if content else []
+    return [f"{role}: {settled(content, role, place, Said()).understood}" for role in SIDES] if content else []
 
 
 def require_own(path: Path, quaternions: Order = "wxyz") -> None:
@@ -486,7 +484,7 @@ def _no_poses(table: Table) -> InputError:
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
     """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
     with a line on how they were read."""
-    wanted, first, statements = FRAMES[role][0], content.sides[0], statements.of(role)
+    wanted, first, statements = SIDES[role][0], content.sides[0], statements.of(role)
     side = content.of(role) or (first if len(content.sides) == 1 and first.frames is None else None)
     if side is None:
         held = first.frames.name if first.frames else "poses"
@@ -512,7 +510,7 @@ def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> P
 
 def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> KnownName:
     """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
-    option, frames = next((name for name in statements.frames if name in FRAMES[role]), None), side.frames
+    option, frames = next((name for name in statements.frames if name in SIDES[role]), None), side.frames
     if option is not None and frames is not None and frames.stated and frames.name != option:
         said = f"{path}: {frames.name} {frames.by}, --poses-are {option}; if the name is wrong, change it in the file"
         name = inverse_name(frames.by.rpartition(" ")[2])
@@ -521,7 +519,7 @@ def _direction(side: PoseSide, role: Role, path: Path, statements: Said) -> Know
         return KnownName(option, "as you say")
     if frames is None and side.trajectory and role == "camera":
         return KnownName("board_from_camera", "by default, the camera's trajectory")
-    return frames or KnownName(FRAMES[role][0], "by default")
+    return frames or KnownName(SIDES[role][0], "by default")
 
 
 def _unit(side: PoseSide, name: str, path: Path, statements: Said) -> tuple[KnownName, str]:

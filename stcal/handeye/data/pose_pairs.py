@@ -15,8 +15,12 @@ from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import LENGTHS, Table, read_table
 
-SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
-"""Transforms that each row must hold, with the inverse that is accepted in place of each."""
+Role = Literal["robot", "camera"]
+SIDES: dict[Role, tuple[str, str]] = {
+    "robot": ("base_from_flange", "flange_from_base"),
+    "camera": ("camera_from_board", "board_from_camera"),
+}
+"""Transform that each row must hold of each side, with the inverse that is accepted in its place."""
 LengthUnit = Literal["mm", "m", "cm", "um", "in"]  # units of translations
 
 
@@ -196,7 +200,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     line; copied poses.
     """
     table = read_table(path, "pose file", quaternions)
-    sides = [read_side(table, *names) for names in SIDES]
+    sides = [read_side(table, *names) for names in SIDES.values()]
     (flange, flange_covariance, _), (board, board_covariance, common) = sides
     names = tuple(f"line {line}" for line in table.lines)
     return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where, common)
@@ -208,7 +212,7 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
         needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
-        other = [name for side in SIDES if wanted not in side for name in side]
+        other = [name for side in SIDES.values() if wanted not in side for name in side]
         swapped = not names and any(column.startswith(f"{name}_") for name in other for column in table.columns)
         exchanged = "; it has those of the other side: exchange the files" if swapped else ""
         raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}{exchanged}")

@@ -11,7 +11,7 @@ from stcal.handeye.data.pose_files import read_robot
 from stcal.handeye.data.pose_partners import rows_of_images
 from stcal.workflows.handeye_inputs import Files
 from tests.handeye.test_cli import NOISE
-from tests.handeye.written import FORMATS, REFUSED, easy_handeye, matrices, poses_file
+from tests.handeye.written import FORMATS, REFUSED, easy_handeye, poses_file
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.support.handeye import simulated
 
@@ -147,9 +147,9 @@ def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path,
 
 
 def test_a_dry_run_says_what_motion_is_missing(command, tmp_path, truth):
-    still = matrices(truth.pairs.base_from_flange)
+    still = truth.pairs.base_from_flange.matrix()
     still[:, :3, :3] = still[0, :3, :3]
-    np.savez(tmp_path / "p.npz", base_from_flange=still, camera_from_board=matrices(truth.pairs.camera_from_board))
+    np.savez(tmp_path / "p.npz", base_from_flange=still, camera_from_board=truth.pairs.camera_from_board.matrix())
     code, shown, _ = command(tmp_path / "p.npz", "--dry-run")
     assert code == 0
     assert "motions: the flange turns by 0° (RMS) between poses; rotate the flange" in shown

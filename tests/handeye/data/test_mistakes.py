@@ -14,12 +14,12 @@ from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_pairs, read_robot, read_two
 from stcal.handeye.data.pose_partners import partners
 from stcal.workflows.handeye_inputs import Files
-from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
+from tests.handeye.written import easy_handeye, in_metres, message, moveit, tum
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 5).pairs
-GOOD = matrices(PAIRS.base_from_flange)
+GOOD = PAIRS.base_from_flange.matrix()
 
 
 def refused(path, said=None, call=read_robot) -> str:
@@ -168,7 +168,7 @@ def test_bad_options_are_named():
 
 
 def test_a_direction_that_the_file_states_is_not_changed(tmp_path):
-    np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=matrices(PAIRS.camera_from_board))
+    np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=PAIRS.camera_from_board.matrix())
     said = Said(frames=("base_from_flange",))
     assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in refused(
         tmp_path / "p.npz", said, read_pairs
@@ -201,7 +201,7 @@ def test_samples_without_one_side_are_named(tmp_path):
 
 def test_rows_of_two_files_that_do_not_fit(tmp_path):
     np.save(tmp_path / "a.npy", GOOD)
-    np.save(tmp_path / "b.npy", matrices(PAIRS.camera_from_board)[:4])
+    np.save(tmp_path / "b.npy", PAIRS.camera_from_board.matrix()[:4])
     refuses("E-POSES-COUNT … 5 … 4", read_two, tmp_path / "a.npy", tmp_path / "b.npy", Said(), "image")
     _, a, _, b = tum(tmp_path, PAIRS)
     with fails_with("E-POSES-UNNAMED … b.npy … 100.5000"):

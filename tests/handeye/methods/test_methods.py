@@ -105,16 +105,13 @@ def test_evolution_follows_its_rules():
     assert objective.linear(still).cost == pytest.approx(costs[0], rel=1e-12)
 
 
-def test_wrong_arguments():
+def test_wrong_arguments_and_options():
     pairs = simulated(np.random.default_rng(3), 6).pairs
     refuses("E-OPTION-METHOD … 'tsai' … tsai-lenz", handeye, pairs, method="tsai")
     refuses("E-HANDEYE-SETUP … 'hand-in-eye' … eye-in-hand or eye-to-hand", handeye, pairs, "hand-in-eye")
     refuses("E-HANDEYE-NEEDS-VIEWS", handeye, pairs, method="reprojection")
     with fails_with("E-HANDEYE-NO-TRANSFORM … eye-in-hand … base_from_camera"):
         _ = handeye(pairs).base_from_camera
-
-
-def test_wrong_options():
     refuses("E-EVOLUTION-OPTIONS … 3", EvolutionOptions, population=3)
     refuses("E-EVOLUTION-OPTIONS … -1", Bounds, -1.0)
     refuses("E-EVOLUTION-OPTIONS … 1e+308", Bounds, 1e308)
