@@ -204,9 +204,8 @@ class Files:
         first, second = self.source, self.second
         if second is None or not isinstance(first, Path):
             return first, ()
-        if told := read_two(
-            first, second, self.statements, self.key, self.quaternions, self.tolerance_s, self.time_offset
-        ):
+        timing = self.tolerance_s, self.time_offset
+        if told := read_two(first, second, self.statements, self.key, self.quaternions, *timing):
             return told, ()
         for path in (first, second):
             require_own(path, self.quaternions)
