@@ -14,7 +14,7 @@ from stcal.geometry.rigid import by_pose
 from stcal.handeye.choose import ChosenWay, choose
 from stcal.handeye.conventions import flipped
 from stcal.handeye.data.corner_views import Views
-from stcal.handeye.data.pose_files import HandEyeInput
+from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, LengthUnit, Loop, Setup
 from stcal.handeye.handeye_problem import METHODS, HandEye, HandEyeOptions, problem_of
 from stcal.handeye.methods.pose_adjustment import UNKNOWNS

@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import remarks
 from stcal.handeye.conventions import check_conventions, flipped, repair
 from stcal.handeye.data.corner_views import Views, resect
-from stcal.handeye.data.pose_files import HandEyeInput
+from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, EvolutionOptions

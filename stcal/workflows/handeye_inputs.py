@@ -13,9 +13,8 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order
 from stcal.handeye import View, Views, pairs_of_views
-from stcal.handeye.data.pose_content import PoseSide, Said
+from stcal.handeye.data.pose_content import HandEyeInput, PoseSide, Said
 from stcal.handeye.data.pose_files import (
-    HandEyeInput,
     own_told,
     read_pairs,
     read_robot,

@@ -1,4 +1,5 @@
-"""The content of a file of poses: which of its values are poses, of which side, and what the user states beside it."""
+"""The content of a file of poses: which of its values are poses, of which side, and what the user states beside it; and
+the pairs that both sides give."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,8 +10,11 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pose_pairs import SIDES, Role, Setup
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.corner_views import Views
+from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Role, Setup
+from stcal.handeye.data.stream import Timed
+from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.rotations import of_quaternions, proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -73,6 +77,39 @@ class PoseSide:
     def called(self) -> tuple[str, ...]:
         """Returns the names of the rows, or their places."""
         return self.names or self.places
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeInput:
+    """Input of a hand-eye calibration.
+
+    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
+    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
+    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    """
+
+    where: str
+    pairs: HandEyePoses
+    views: Views | None = None
+    symmetries: tuple[Rigid, ...] = ()
+    prior: CameraPrior | None = None
+    pitch_mm: float | None = None
+    left_out: tuple[tuple[str, str], ...] = ()
+    understood: tuple[str, ...] = ()
+    setup: Setup | None = None
+    timed: Timed | None = None
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, lines: Sequence[str] = (), **more: Any
+    ) -> "HandEyeInput":
+        """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
+        covariances = robot.covariance, camera.covariance
+        pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
+        understood = (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines)
+        return cls(where, pairs, understood=understood, **more)
 
 
 @dataclass(frozen=True, slots=True)

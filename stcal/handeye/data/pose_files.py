@@ -6,9 +6,8 @@ import re
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,10 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Order, Poses, Rigid
-from stcal.handeye.data.corner_views import Views
+from stcal.geometry.rigid import Order, Poses
 from stcal.handeye.data.pose_content import (
     EVERY_FRAME,
+    HandEyeInput,
     KnownName,
     PoseContent,
     PoseSide,
@@ -28,10 +27,9 @@ from stcal.handeye.data.pose_content import (
     read_tree,
     require_each_once,
 )
-from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Role, Setup, inverted, read_poses, read_side
+from stcal.handeye.data.pose_pairs import SIDES, Role, inverted, read_poses, read_side
 from stcal.handeye.data.pose_partners import matched
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, taken_at
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.join import keys_of
 from stcal.io.rotations import (
@@ -306,39 +304,6 @@ METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
 are farther from base and camera than 5 mm, and nearer than 50 m."""
 MIXED = 100.0  # ratio of the farthest to the nearest pose above which poses are in two units
 SHOWN = 4  # keys that a message names
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeInput:
-    """Input of a hand-eye calibration.
-
-    ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
-    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
-    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
-    """
-
-    where: str
-    pairs: HandEyePoses
-    views: Views | None = None
-    symmetries: tuple[Rigid, ...] = ()
-    prior: CameraPrior | None = None
-    pitch_mm: float | None = None
-    left_out: tuple[tuple[str, str], ...] = ()
-    understood: tuple[str, ...] = ()
-    setup: Setup | None = None
-    timed: Timed | None = None
-    notes: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls, robot: PoseSide, camera: PoseSide, names: Sequence[str], where: str, lines: Sequence[str] = (), **more: Any
-    ) -> "HandEyeInput":
-        """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
-        covariances = robot.covariance, camera.covariance
-        pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
-        understood = (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines)
-        return cls(where, pairs, understood=understood, **more)
 
 
 def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> HandEyeInput:

@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.corner_views import View, Views, pairs_of_views
-from stcal.handeye.data.pose_files import HandEyeInput
+from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import by_robot, outcome_report
 from stcal.handeye.handeye_pipeline import Outcome

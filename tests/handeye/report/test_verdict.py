@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.pose_files import HandEyeInput
+from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.remarks import Aside, Grave
 from stcal.handeye.validate import cross_validate, splits
