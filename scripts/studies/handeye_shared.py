@@ -19,9 +19,10 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.handeye_file import HandEyeFile
 from stcal.handeye.handeye_page import outcome_report
+from stcal.handeye.handeye_pipeline import ALL
 from stcal.io.cameras.read import read_camera, save_camera
 from stcal.workflows.handeye_inputs import read_handeye
-from stcal.workflows.handeye_run import ALL, calibrate_handeye
+from stcal.workflows.handeye_run import calibrate_handeye
 
 # The two camera files of the data set differ by 8 and 14 px, and have no distortion.
 DOTS_CAMERA_SIGMA = (10.0, 10.0, 15.0, 15.0, 0.1, 0.1, 0.01, 0.01)

@@ -88,11 +88,6 @@ def test_only_what_the_robot_reaches_is_planned():
 
 
 @pytest.fixture
-def plan(command):
-    return lambda *arguments: command("plan", *arguments)
-
-
-@pytest.fixture
 def taken(tmp_path):
     """Six poses in the reach of the example of a robot, and its file."""
     save_robot(tmp_path / "robot.toml", mh80())
@@ -103,10 +98,10 @@ TAKEN = simulated(np.random.default_rng(8), 6, tilt=0.2, **NOISE)
 
 
 @pytest.mark.slow
-def test_poses_and_joint_values_are_named(plan, taken, tmp_path):
+def test_poses_and_joint_values_are_named(command, taken, tmp_path):
     poses, robot_file = taken
     table, written = tmp_path / "next.csv", tmp_path / "n.json"
-    code, shown, _ = plan(poses, "--robot", robot_file, "--count", 1, "--out", table, "--json", written)
+    code, shown, _ = command("plan", poses, "--robot", robot_file, "--count", 1, "--out", table, "--json", written)
     assert code == 0, shown
     robot, data = load_robot(robot_file), json.loads(written.read_text())
     with table.open(newline="", encoding="utf-8") as stream:
@@ -125,16 +120,16 @@ def test_poses_and_joint_values_are_named(plan, taken, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(plan, taken):
+def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(command, taken):
     poses, robot_file = taken
     arm = mh80()
     save_robot(robot_file, replace(arm, rows=tuple(replace(row, a=row.a / 9, d=row.d / 9) for row in arm.rows)))
     said = "reaches 0 of the 6 poses taken, first not line 2; give the robot's own file"
-    assert_error(plan(poses, "--robot", robot_file), INPUT, said)
+    assert_error(command("plan", poses, "--robot", robot_file), INPUT, said)
 
 
 @pytest.mark.slow
-def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
+def test_a_limit_that_some_poses_taken_pass_is_noted(command, taken):
     """The limit is halfway between the second and third value of the first joint."""
     poses, robot_file = taken
     arm = mh80()
@@ -142,6 +137,6 @@ def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
     assert (np.abs(first) < np.radians(60)).all()  # so that turned round the robot would have to bend over backwards
     limited = Joint("revolute", float(first[1:3].mean()), np.radians(60))
     save_robot(robot_file, replace(arm, joints=(limited, *arm.joints[1:])))
-    code, shown, _ = plan(poses, "--robot", robot_file, "--count", 1)
+    code, shown, _ = command("plan", poses, "--robot", robot_file, "--count", 1)
     assert code == 0
     assert "of the 6 poses taken, not line" in shown

@@ -31,7 +31,7 @@ def test_files_in_every_form_say_the_same(tmp_path, truth, unit, robot, camera):
     assert pairs.names[:2] == ("line 2", "line 3")
 
 
-def test_bad_cells_are_named_by_line(tmp_path, truth):
+def test_bad_cells_and_sides_are_named(tmp_path, truth):
     for row, column, cell, error in (
         (2, 0, "nan", "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
         (5, 13, "3", "E-QUATERNION-LENGTH … line 7"),
@@ -39,9 +39,6 @@ def test_bad_cells_are_named_by_line(tmp_path, truth):
     ):
         path = poses_file(tmp_path / "poses.csv", truth, lambda rows: rows[row].__setitem__(column, cell))  # noqa: B023
         refuses(error, read_poses, path)
-
-
-def test_missing_and_doubled_sides(tmp_path, truth):
     flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
     every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
     for sides, fault in (({"base_from_flange": flange}, "no such columns … camera_from_board"), (every, "both … base")):
