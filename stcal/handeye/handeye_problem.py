@@ -321,7 +321,8 @@ class HandEyeProblem:
         sigma_scale = float(np.sqrt(solution.inverse[UNKNOWNS, UNKNOWNS])) if options.with_scale else None
         board = common = by_poses = None
         if options.four_dof:
-            x, z, covariance, notes = self._without_slide(x, z, solution.normal)
+            x, z, covariance, slide = self._without_slide(x, z, solution.normal)
+            notes = (*notes, slide)
         if isinstance(solution, PoseSolution):
             by_poses, residuals = solution, solution.residuals
         else:
@@ -435,8 +436,8 @@ class HandEyeProblem:
             notes += remarks.of_size(loop[good], hint, options.noise)
         return notes + remarks.of_distance(loop)
 
-    def _without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, Remarks]:
-        """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
+    def _without_slide(self, x: Rigid, z: Rigid, normal: np.ndarray) -> tuple[Rigid, Rigid, np.ndarray, str]:
+        """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and a note."""
         axis, frames = self.seen.mount_axis, FRAMES[self.setup]
         x, z = closed_form.slid(x, z, axis, self.loop)
         held = normal.copy()
@@ -444,7 +445,7 @@ class HandEyeProblem:
         note = f"{frames.camera} is not known along {in_words(axis)} of the {frames.mount}, the one axis about which "
         note += f"the flange turns: it is set to 0 there, and {frames.board} goes with it; measure one of them along "
         note += "that axis"
-        return x, z, generalised_inverse(held), (*self.notes, note)
+        return x, z, generalised_inverse(held), note
 
 
 def problem_of(given: HandEyeInput, options: HandEyeOptions) -> HandEyeProblem:
