@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import ndtr
 
+from stcal.boards.board_designs import UNIT_SQUARE
 from stcal.geometry.plane import apply_homography, fit_homographies
 
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel about its centre, px²
@@ -164,7 +165,7 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     """Return the displacement of edges by sampling, estimated from the lines between cells, which are evenly spaced
     apart from perspective and lens: what is left of them and follows the phase of the pixels. And that by other errors,
     such as the print: the rest of their scatter."""
-    square = np.broadcast_to(cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), outer.corners_px.shape)
+    square = np.broadcast_to(cells * (UNIT_SQUARE + 0.5), outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
     middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
     xy = apply_homography(image_from_grid, middle).astype(np.float32)

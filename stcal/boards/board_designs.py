@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -88,16 +87,16 @@ NESTED = 0.5
 """Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 
 
-def sides_mm(corners_mm: np.ndarray) -> np.ndarray:
+def mean_sides(corners: np.ndarray) -> np.ndarray:
     """Return the mean side (n,) of each of n quadrilaterals (n, 4, 2)."""
-    return np.linalg.norm(corners_mm - np.roll(corners_mm, 1, axis=1), axis=2).mean(1)
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(1)
 
 
 def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusual_size: bool, where: str) -> None:
     """Refuse tags whose sides are in another unit than mm, and tags that lie on each other. ``corners_mm`` : (n, 4,
     2), NaN for tags of no known place."""
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
-    ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
+    ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), mean_sides(corners_mm[known])
     lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))
     require_millimetres(lengths, unusual_size, where)
     for i in range(1, len(ids)):
@@ -106,11 +105,9 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
         over = np.flatnonzero((apart < smaller / 2) & (smaller > NESTED * larger) & (np.array(ids[:i]) != ids[i]))
         if len(over):
             j = over[0]
-            raise InputError(
-                "E-TAG-OVERLAP",
-                f"{where}: tags {ids[j]} and {ids[i]} lie on each other: {apart[j]:.3g} mm apart, "
-                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; check that places are not in metres, and correct them",
-            )
+            places = f"{apart[j]:.3g} mm apart, sides {sides[j]:.3g} and {sides[i]:.3g} mm"
+            fault = f"{where}: tags {ids[j]} and {ids[i]} lie on each other: {places}"
+            raise InputError("E-TAG-OVERLAP", f"{fault}; check that places are not in metres, and correct them")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -230,12 +227,11 @@ class LatticePart(BoardDesign):
     """A grid of dots in which only some places have a dot."""
 
     taken: np.ndarray | None = None  # (n, 2) rows and columns of these places
-    circles: "AsymmetricCirclesDesign | None" = None  # that these are, if any
-    hexagonal: bool = False  # whether rows are shifted by half a pitch each
+    printed: "FlatBoard | None" = None  # the board whose points these are
 
     def steps(self) -> np.ndarray:
         """Return the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
-        return HEXAGONAL.copy() if self.hexagonal else BoardDesign.steps(self)
+        return HEXAGONAL.copy() if isinstance(self.printed, HexagonalCirclesDesign) else BoardDesign.steps(self)
 
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
@@ -267,7 +263,6 @@ class AsymmetricCirclesDesign:
     polarity: Polarity
     sigma_mm: float = 0.005
     rings: tuple[tuple[int, int], ...] = ()
-    hexagonal: ClassVar[bool] = False
 
     def __post_init__(self):
         require_fields(self, "asymmetric circles")
@@ -305,8 +300,7 @@ class AsymmetricCirclesDesign:
         rows, columns = (cells.max(0) + 1).tolist()
         sizes = rows, columns, self.nearest_mm(), self.radii_mm()[0]
         rings = tuple(tuple(cells[row * self.columns + place].tolist()) for row, place in self.rings)
-        of = {"rings": rings, "taken": cells, "circles": self, "hexagonal": self.hexagonal}
-        return LatticePart(*sizes, self.polarity, self.sigma_mm, **of)
+        return LatticePart(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, printed=self)
 
 
 HEXAGONAL = np.array([[1.0, 0.5], [0.0, np.sqrt(3) / 2]])
@@ -318,8 +312,6 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
     """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step. Circle (i,
     j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i · √3 / 2 ·
     ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`."""
-
-    hexagonal: ClassVar[bool] = True
 
     def _steps(self) -> np.ndarray:
         return self._cells()[:, ::-1] @ HEXAGONAL.T
@@ -346,7 +338,6 @@ class CornerBoard(LatticePart):
 
     y_mm: tuple[float, ...] = ()  # of the rows, which need not be equally spaced
     x_mm: tuple[float, ...] = ()  # of the columns
-    printed: FlatBoard | None = None  # the board itself
 
     def scaled(self, factor: float) -> "CornerBoard":
         """Return the board printed larger by a factor."""
@@ -370,8 +361,7 @@ class CornerBoard(LatticePart):
 
     def xy_mm(self) -> np.ndarray:
         """Return the positions of the points, (n, 2), mm."""
-        row, column = self.cells().T
-        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row]])
+        return self.places_mm(self.labels())[:, :2]
 
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
         """Return the positions of these points, (n, 3), board frame."""

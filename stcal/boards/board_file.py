@@ -19,8 +19,8 @@ from stcal.boards.board_designs import (
     FlatBoard,
     HexagonalCirclesDesign,
     TagLayout,
+    mean_sides,
     require_tags,
-    sides_mm,
 )
 from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
 from stcal.boards.foreign import KEYS as BUNDLE_KEYS
@@ -263,18 +263,15 @@ class TagsFile(Sized):
 
 def load_tags(path: str | Path, what: str) -> TagsFile:
     """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML)."""
-    try:
-        content = yaml_content(text_of(read_bytes(path, SETTINGS_BYTES)), BUNDLE_KEYS)
-    except (OSError, UnicodeDecodeError):
-        content = None  # the error of the reader of TOML says why
-    if content is None:
+    content, where = board_content(path), f"{what} {path}"
+    if content is None or BUNDLE_KEYS.isdisjoint(content):  # the error of the reader of TOML says why
         return load_toml(path, TagsFile, what, REMEDY)
-    where = f"{what} {path}"
     return validated(tags_of_bundle(content, where), TagsFile, where)
 
 
-def require_sizes(data: TagsFile, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are."""
+def placed_corners(data: TagsFile, where: str) -> np.ndarray:
+    """Return the corners (n, 4, 2), mm, NaN where the file states no place. Refuse tags whose sides are in another unit
+    than mm, and tags that lie on each other, for their places are."""
     sides, corners = [], np.full((len(data.tag), 4, 2), np.nan)
     for k, tag in enumerate(data.tag):
         if (place := tag.corners(where)) is not None:
@@ -282,17 +279,17 @@ def require_sizes(data: TagsFile, where: str) -> None:
         if tag.size_mm is not None:
             sides.append(side(f"size_mm of tag {tag.id}", tag.size_mm))
         elif place is not None:
-            sides.append(side(f"side of tag {tag.id} by corners_mm", float(sides_mm(place[None])[0])))
+            sides.append(side(f"side of tag {tag.id} by corners_mm", float(mean_sides(place[None])[0])))
     require_millimetres(sides, data.unusual_size, where)
     require_tags([(tag.dictionary, tag.id) for tag in data.tag], corners, True, where)
+    return corners
 
 
 def _tags(data: TagsFile, where: str) -> TagLayout:
-    require_sizes(data, where)
-    corners = [tag.corners(where) for tag in data.tag]
+    corners = placed_corners(data, where)
     for tag, place in zip(data.tag, corners, strict=True):
         place_of_tag = f"{where}: tag {tag.id}"
-        if place is None:
+        if np.isnan(place).any():
             raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
         if tag.id >= (count := count_of(tag.dictionary)):
             raise InputError("E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct it")
@@ -305,7 +302,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
             raise InputError("E-TAG-CORNERS", f"{fault}; {needed}")
     with named(where):
         tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
-        return TagLayout(tags, np.array(corners), data.sigma_mm, data.unusual_size)
+        return TagLayout(tags, corners, data.sigma_mm, data.unusual_size)
 
 
 KINDS: dict[str, tuple[type, Any]] = {
@@ -337,12 +334,12 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     try:
         return toml_of(text)
     except (ValueError, RecursionError):
-        return yaml_content(text, ("target_type",) if "target_type" in text else BUNDLE_KEYS)
+        return yaml_content(text, ("target_type", *BUNDLE_KEYS))
 
 
 def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     """Return the board of keys and values; errors as :func:`load_flat_board`, with ``where`` in front."""
-    if any(key in content for key in BUNDLE_KEYS):
+    if not BUNDLE_KEYS.isdisjoint(content):
         return _tags(validated(tags_of_bundle(content, where), TagsFile, where), where)
     if "target_type" in content:
         return kalibr_board_of(content, where)
@@ -418,7 +415,7 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
 
 def _lengths(board: FlatBoard) -> list[Length]:
     if isinstance(board, TagLayout):
-        return [side("side of a tag", float(mm)) for mm in sides_mm(board.corners_mm)]
+        return [side("side of a tag", float(mm)) for mm in mean_sides(board.corners_mm)]
     if isinstance(board, AsymmetricCirclesDesign):
         return [side("spacing_mm", board.spacing_mm), radius("radius of the circles", board.radius_mm or 0.0)]
     names = ("square_mm", "marker_mm", "tag_mm")
@@ -427,8 +424,7 @@ def _lengths(board: FlatBoard) -> list[Length]:
 
 def board_toml(board: BoardDesign) -> str:
     """Return the text of a file that :func:`load_board` reads; with comments for a board of dots."""
-    printed = getattr(board, "printed", None) or getattr(board, "circles", None)
-    if printed is not None:
+    if (printed := getattr(board, "printed", None)) is not None:
         rows = tag_rows(printed) if isinstance(printed, TagLayout) else []
         lines = [f'type = "{TYPES[type(printed)]}"', *stated_unusual(_lengths(printed)), *keys_of(printed)]
         return "".join(f"{line}\n" for line in [*lines, *(["tag = [", *rows, "]"] if rows else [])])

@@ -3,7 +3,7 @@
 apriltag_ros has bundles with a place for each tag, and standalone tags with their sizes alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from stcal.io.rotations import of_quaternions
 from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
 from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM
 
-KEYS = ("tag_bundles", "standalone_tags")
+KEYS = frozenset(("tag_bundles", "standalone_tags"))
 Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
@@ -60,7 +60,7 @@ class _BundlesFile(Strict):
     standalone_tags: list[_Tag] = Field(default_factory=list)
 
 
-def yaml_content(text: str, keys: Sequence[str]) -> dict[str, Any] | None:
+def yaml_content(text: str, keys: Collection[str]) -> dict[str, Any] | None:
     """Return the keys and values of a YAML file with one of these keys; None for any other text."""
     if not any(key in text for key in keys):
         return None
@@ -88,11 +88,9 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
     off = np.abs(at[:, 2] - at[0, 2])
     for place, angle, height in zip(places, tilt, off, strict=True):
         if angle > FLAT_RAD or height > FLAT_MM:
-            raise InputError(
-                "E-LAYOUT-FLAT",
-                f"{where}: {place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle, none "
-                "allowed: targets are flat here; give the tags of one plane",
-            )
+            off = f"{place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle"
+            remedy = "none allowed: targets are flat here; give the tags of one plane"
+            raise InputError("E-LAYOUT-FLAT", f"{where}: {off}, {remedy}")
     corners_of_one = UPRIGHT if data.upright or is_of_apriltag(data.tag_family) else CORNERS
     tags = []
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):
@@ -152,11 +150,9 @@ def kalibr_board_of(content: dict[str, Any], where: str) -> FlatBoard:
             raise InputError("E-TAG-ID-RANGE", f"{fault}; correct them")
         size = METRE_MM * data.tagSize
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
-            raise InputError(
-                "E-BOARD-SPACING",
-                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap divided by "
-                f"tagSize, not a length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
-            )
+            usual = f"at least {LEAST_GAP:g} usual: it is the gap divided by tagSize, not a length"
+            same = f"of a gap of {data.tagSpacing:g} m it is {ratio:.4g}"
+            raise InputError("E-BOARD-SPACING", f"{where}: tagSpacing {data.tagSpacing:g}, {usual}; {same}")
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, KALIBR_FAMILY)
     if kind == "checkerboard":
         data = validated(content, _Checkerboard, where)

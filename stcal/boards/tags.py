@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from stcal.boards.board_designs import AprilGridDesign, BoardView, TagLayout, view_of
+from stcal.boards.board_designs import AprilGridDesign, BoardView, TagLayout, mean_sides, view_of
 from stcal.boards.dictionaries import FAMILIES, cells_of, dictionary_of, find_family
 from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 
@@ -36,23 +35,24 @@ class Tags:
 
     tags: tuple[tuple[str, int], ...]  # dictionary and id
     corners_px: np.ndarray  # (n, 4, 2) top left, top right, bottom right, bottom left as printed
-    covariance_px2: np.ndarray  # (n, 4, 2, 2)
+    joint_px2: np.ndarray  # (n, 8, 8) covariances of the four corners of a tag together
     repeated: tuple[tuple[str, int], ...] = ()  # tags that were omitted because they occur more than once
     saturated: np.ndarray | None = None  # (n,) share of the white around a tag, see :meth:`edge_sigma_px`
-    joint_px2: np.ndarray | None = None  # (n, 8, 8) of the four corners of a tag together; None: independent
     smear_px: float = 0.0  # way by which motion during the exposure blurs edges; 0 where it is short
 
     def __post_init__(self):
         freeze(self, "corners_px", (len(self.tags), 4, 2), "tags' corners")
-        shape = (len(self.tags), 4, 2, 2)
-        freeze(self, "covariance_px2", shape, "corners' covariances")
+        freeze(self, "joint_px2", (len(self.tags), 8, 8), "tags' covariances")
         share = np.zeros(len(self.tags)) if self.saturated is None else self.saturated
         object.__setattr__(self, "saturated", frozen(share, (len(self.tags),), "saturated shares"))
-        joint = block_diagonal(self.covariance_px2) if self.joint_px2 is None else self.joint_px2
-        object.__setattr__(self, "joint_px2", frozen(joint, (len(self.tags), 8, 8), "tags' covariances"))
 
     def __len__(self) -> int:
         return len(self.tags)
+
+    def corner_covariances_px2(self) -> np.ndarray:
+        """Return the covariances (n, 4, 2, 2) of single corners."""
+        corner = np.arange(4)
+        return np.moveaxis(self.joint_px2.reshape(-1, 4, 2, 4, 2)[:, corner, :, corner], 0, 1)
 
     def edge_sigma_px(self) -> np.ndarray:
         """Return σ (n,) of an outward or inward shift that all edges of a tag share, and residuals do not show."""
@@ -106,13 +106,7 @@ def find_tags(
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
     joint = covariance + uneven[:, None, None] * np.eye(8)
     repeated = tuple(sorted(tag for tag, places in places_of.items() if len(places) > 1))
-    return Tags(tuple(once), corners, corner_blocks(joint), repeated, saturated, joint, smear_px)
-
-
-def corner_blocks(joint: np.ndarray) -> np.ndarray:
-    """Return the covariances (n, 4, 2, 2) of single corners from those of four together, (n, 8, 8)."""
-    corner = np.arange(4)
-    return np.moveaxis(joint.reshape(-1, 4, 2, 4, 2)[:, corner, :, corner], 0, 1)
+    return Tags(tuple(once), corners, joint, repeated, saturated, smear_px)
 
 
 def _looks(grey: np.ndarray, joined: bool) -> Iterator[tuple[np.ndarray, int, float]]:
@@ -165,7 +159,7 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
     if not known:
         return None
     ids = np.concatenate([4 * row[tags.tags[k]] + np.arange(4) for k in known])
-    covariance = tags.covariance_px2[known].reshape(-1, 2, 2)
+    covariance = tags.corner_covariances_px2()[known].reshape(-1, 2, 2)
     view = view_of(image, layout, ids, tags.corners_px[known].reshape(-1, 2), covariance)
     return replace(view, unused=tuple(f"tag {tag[1]} is in view more than once" for tag in tags.repeated if tag in row))
 
@@ -277,9 +271,7 @@ def _off(view: BoardView, camera: Camera) -> np.ndarray:
     """Return the RMS deviation of each tag's corners from their places in the plane, in sides of the tag as seen."""
     observed = camera.normalised_from_pixel(view.xy_px)
     predicted = apply_homography(fit_homography(view.xyz_board[:, :2], observed), view.xyz_board[:, :2])
-    corners = observed.reshape(-1, 4, 2)
-    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(1)
-    return np.sqrt(((predicted - observed) ** 2).sum(1).reshape(-1, 4).mean(1)) / side
+    return np.sqrt(((predicted - observed) ** 2).sum(1).reshape(-1, 4).mean(1)) / mean_sides(observed.reshape(-1, 4, 2))
 
 
 def _why_off(view: BoardView, board: AprilGridDesign, camera: Camera) -> str:

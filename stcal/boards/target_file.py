@@ -250,11 +250,9 @@ def _of_print(entry: _PrintedFile, unusual_size: bool, where: str) -> FaceDesign
         content.setdefault("unusual_size", True)
     board = flat_board(content, f"{where}: {'tags' if entry.board is None else 'board'}")
     if not isinstance(board, CharucoDesign | AprilGridDesign | TagLayout):
-        raise InputError(
-            "E-TARGET-PRINTED",
-            f"{where}: board: type {content.get('type', 'circles')}; charuco or aprilgrid needed, as a face must "
-            "differ from the others; give tags with `tags`, and dots as circles",
-        )
+        needed = "charuco or aprilgrid needed, as a face must differ from the others"
+        fault = f"{where}: board: type {content.get('type', 'circles')}; {needed}"
+        raise InputError("E-TARGET-PRINTED", f"{fault}; give tags with `tags`, and dots as circles")
     rough = None if entry.rough_pose is None else _rough_pose(entry.rough_pose, where) @ INWARDS
     outline = None if entry.outline_mm is None else np.array(entry.outline_mm)
     more = {"rough_target_from_face": rough, "outline_mm": outline}
@@ -440,9 +438,15 @@ def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
         places.append(validated(place, _Place, entry_place).common(entry_place))
         boards.append(_board(Path(path), entry_board, entry_place))
         names.append(f"board {count}" + (f" ({Path(entry_board['file']).name})" if "file" in entry_board else ""))
-    board_set = BoardSet(tuple(names), tuple(boards), tuple(places))
-    _require_told_apart(board_set, where)
-    return board_set
+    for name, board in zip(names, boards, strict=True):
+        if not board.unique() if isinstance(board, BoardDesign) else board.symmetries():
+            fault = f"{name} looks the same when turned, so that its points cannot be numbered in the common frame"
+            needed = "a chessboard of an odd and an even side, a larger corner dot, or tags needed"
+            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {fault}; {needed}")
+    for (first_name, first), (second_name, second) in combinations(zip(names, boards, strict=True), 2):
+        if reason := _alike(first, second):
+            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {first_name} and {second_name} look alike: {reason}")
+    return BoardSet(tuple(names), tuple(boards), tuple(places))
 
 
 def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
@@ -455,19 +459,6 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
         raise InputError("E-BOARD-KEY-CONFLICT", beside)
     with named(where):
         return load_flat_board(path.parent / entry["file"])
-
-
-def _require_told_apart(found: BoardSet, where: str) -> None:
-    for name, board in zip(found.names, found.boards, strict=True):
-        if not board.unique() if isinstance(board, BoardDesign) else board.symmetries():
-            raise InputError(
-                "E-BOARD-AMBIGUOUS",
-                f"{where}: {name} looks the same when turned, so that its points cannot be numbered in the common "
-                "frame; a chessboard of an odd and an even side, a larger corner dot, or tags needed",
-            )
-    for (first_name, first), (second_name, second) in combinations(zip(found.names, found.boards, strict=True), 2):
-        if reason := _alike(first, second):
-            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {first_name} and {second_name} look alike: {reason}")
 
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:

@@ -344,8 +344,8 @@ def _add(canvas, shape: Shape) -> None:
         canvas.translate(shape.x, shape.y)
         canvas.rotate(90 if shape.turned else 0)
         canvas.setFont("Helvetica", shape.height / CAPITAL_SHARE)  # which every reader has; its Greek is Symbol's
-        draw = {"start": canvas.drawString, "middle": canvas.drawCentredString, "end": canvas.drawRightString}
-        draw[shape.anchor](0, 0, shape.words)
+        draw = canvas.drawCentredString if shape.anchor == "middle" else canvas.drawString
+        draw(0, 0, shape.words)
         canvas.restoreState()
     elif isinstance(shape, Disc):
         arcs = 8  # leave the circle by less than 5 parts in a million of its radius
@@ -461,9 +461,8 @@ def net_text(target: TargetDesign) -> str:
     """Return how large the net of a body is, and which paper takes it."""
     part = net_part(target)
     paper = paper_for([part])
-    return (
-        f"net to fold, {_size(np.ptp(part.outline, axis=0))}: {f'one sheet of {paper}' if paper else 'larger than A0'}"
-    )
+    sheet = f"one sheet of {paper}" if paper else "larger than A0"
+    return f"net to fold, {_size(np.ptp(part.outline, axis=0))}: {sheet}"
 
 
 def _size(sides: np.ndarray) -> str:

@@ -17,6 +17,7 @@ from stcal.boards.board_designs import (
     TagLayout,
     black_areas,
     clear_mm,
+    column_row,
 )
 from stcal.boards.target_file import INWARDS, ROUGH_KEYS
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
@@ -72,14 +73,14 @@ class Text:
     y: float
     words: str
     height: float = 2.5  # of capitals
-    anchor: Literal["start", "middle", "end"] = "start"
+    anchor: Literal["start", "middle"] = "start"
     turned: bool = False  # upwards instead of along X
     ink: Ink = "black"
     layer: Layer = "LABELS"
 
     def box(self) -> np.ndarray:
         length = WIDTH_PER_HEIGHT * self.height * len(self.words)
-        before = {"start": 0.0, "middle": length / 2, "end": length}[self.anchor]
+        before = length / 2 if self.anchor == "middle" else 0.0
         box = np.array([[-before, -0.4 * self.height], [length - before, 1.2 * self.height]])
         if self.turned:
             box = np.array([[-box[1, 1], box[0, 0]], [-box[0, 1], box[1, 0]]])
@@ -189,8 +190,7 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
     description = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
     dots = _discs(xy, radii, names, board.polarity)
     if board.rings:
-        in_rows = np.column_stack(np.divmod(np.arange(len(xy)), board.columns))
-        cells = board.cells() if isinstance(board, BoardDesign) else in_rows
+        cells = board.cells() if isinstance(board, BoardDesign) else column_row(board.rows, board.columns)[:, ::-1]
         holed = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
         hole = 0.5  # of the radius of the dot
         other: Polarity = "bright" if board.polarity == "dark" else "dark"
@@ -199,9 +199,19 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
 
 
 def _squares_said(board: SquaresOrTags) -> tuple[str, Spans]:
-    """Return the description of a board, and the lengths to check as :attr:`Part.spans`."""
+    """Return the description of a board, and the lengths to check as :attr:`Part.spans`; of tags those along the sides
+    of the first that lies along the axes."""
     if isinstance(board, TagLayout):
-        return _tags_said(board)
+        tags = board.tags
+        names = ", ".join(f"{tag}" for _, tag in tags) if len(tags) <= 6 else f"{len(tags)}"
+        families = ", ".join(dict.fromkeys(family for family, _ in tags))
+        description = f"tag{'s' if len(tags) > 1 else ''} {names} of {families}"
+        for corners in board.corners_mm * [1, -1]:
+            low, high = box_of(corners)
+            if np.abs(np.abs(corners - (low + high) / 2) - (high - low) / 2).max() < 1e-6:
+                ends = zip(low.tolist(), high.tolist(), strict=True)
+                return description, tuple((axis, a, b, said_mm(b - a)) for axis, (a, b) in enumerate(ends))
+        return description, ()
     if isinstance(board, AprilGridDesign):
         tag = said_mm(board.tag_mm)
         words = f"{tag}, step {said_mm(board.tag_mm * (1 + board.spacing))}"
@@ -217,19 +227,6 @@ def _squares_said(board: SquaresOrTags) -> tuple[str, Spans]:
     across, down = ((count * board.square_mm, count) for count in (columns, rows))
     words = [f"{count} × {said_mm(board.square_mm)} = {said_mm(mm)}" for mm, count in (across, down)]
     return description, ((0, first, first + across[0], words[0]), (1, -first - down[0], -first, words[1]))
-
-
-def _tags_said(layout: TagLayout) -> tuple[str, Spans]:
-    """Return as :func:`_squares_said`; the side of a tag that lies along the axes is what to measure."""
-    names = ", ".join(f"{tag}" for _, tag in layout.tags) if len(layout.tags) <= 6 else f"{len(layout.tags)}"
-    families = ", ".join(dict.fromkeys(family for family, _ in layout.tags))
-    description = f"tag{'s' if len(layout.tags) > 1 else ''} {names} of {families}"
-    for corners in layout.corners_mm * [1, -1]:
-        low, high = box_of(corners)
-        if np.abs(np.abs(corners - (low + high) / 2) - (high - low) / 2).max() < 1e-6:
-            ends = zip(low.tolist(), high.tolist(), strict=True)
-            return description, tuple((axis, a, b, said_mm(b - a)) for axis, (a, b) in enumerate(ends))
-    return description, ()
 
 
 def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
@@ -261,16 +258,16 @@ Edge: TypeAlias = tuple[str, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plate:
-    """A face with net_from_face; ``corners`` : (k, 2) of its outline in the net's plane."""
+    """A face with net_from_face."""
 
     face: FaceDesign
     turn: np.ndarray  # (2, 2)
     shift: np.ndarray  # (2,)
-    corners: np.ndarray
 
-    @classmethod
-    def of(cls, face: FaceDesign, turn: np.ndarray, shift: np.ndarray) -> "_Plate":
-        return cls(face, turn, shift, np.asarray(face.outline_mm) @ turn.T + shift)
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners (k, 2) of its outline in the net's plane."""
+        return np.asarray(self.face.outline_mm) @ self.turn.T + self.shift
 
     def edges(self) -> Iterator[tuple[Edge, np.ndarray]]:
         """Yield the edges with their ends (2, 2)."""
@@ -289,7 +286,7 @@ def net_part(target: TargetDesign) -> Piece:
     faces = {face.id: _against_the_clock(as_seen(face)) for face in target.faces}
     shared = _shared_edges(faces.values())
     first = max(faces, key=lambda face: sum(face == own for own, _ in shared))
-    plates, free = [_Plate.of(faces[first], NO_TURN, np.zeros(2))], faces.keys() - {first}
+    plates, free = [_Plate(faces[first], NO_TURN, np.zeros(2))], faces.keys() - {first}
     folds: set[Edge] = set()
     for plate in plates:  # grows
         for edge, ends in plate.edges():
@@ -337,7 +334,7 @@ def _unfolded(ends: np.ndarray, face: FaceDesign, own: int) -> _Plate:
     last, first = outline[own], outline[(own + 1) % len(outline)]
     angle = np.arctan2(*(ends[1] - ends[0])[::-1]) - np.arctan2(*(last - first)[::-1])
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return _Plate.of(face, turn, (ends[0] + ends[1]) / 2 - turn @ (first + last) / 2)
+    return _Plate(face, turn, (ends[0] + ends[1]) / 2 - turn @ (first + last) / 2)
 
 
 def _is_clear(one: np.ndarray, others: Iterable[np.ndarray]) -> bool:

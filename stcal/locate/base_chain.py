@@ -78,10 +78,8 @@ class GoalChain(Brief):
     def require_poses(self, scenes: Sequence[str]) -> None:
         """Refuses scenes without a robot pose, by InputError."""
         if self.moving and (missing := [scene for scene in scenes if scene not in self.flange]):
-            raise InputError(
-                "E-ROBOT-POSES-SCENE",
-                f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
-            )
+            fault = f"{self.poses_source}: none of scene {missing[0]}"
+            raise InputError("E-ROBOT-POSES-SCENE", f"{fault}; add a row, or remove the scene")
 
 
 def _mounted(hand_eye: object, robot_poses: object) -> tuple[bool, UncertainRigid]:
@@ -113,11 +111,9 @@ def _registered(registration: object) -> UncertainRigid:
     residual = float(np.abs(linear.T @ linear - np.eye(3)).max())
     if read.covariance.shape != (6, 6) or residual > ROTATION_WITHIN or np.linalg.det(linear) < 0:
         kind = read.method if read.method == "liu2017" else read.model
-        raise InputError(
-            "E-REGISTER-FILE",
-            f"{_named('registration', registration)}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from "
-            "1); base_from_camera needs one, register with --model rigid",
-        )
+        fault = f"b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from 1)"
+        remedy = "base_from_camera needs one, register with --model rigid"
+        raise InputError("E-REGISTER-FILE", f"{_named('registration', registration)}: {fault}; {remedy}")
     return UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
 
 
@@ -185,12 +181,10 @@ def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
     for mistake, _ in explain(_mistakes(mount, flange), variation, mm * rad / FAR_BETTER)[:1]:
         robot, camera = mistake.change()
         left_mm, left_rad = _varies(robot @ camera @ seen)
-        raise InputError(
-            "E-LOCATE-VARIES",
-            f"robot poses and hand-eye: the target's pose in the base varies by {mm:.3g} mm and "
-            f"{np.degrees(rad):.3g}° (RMS of {len(seen)} scenes), but by {left_mm:.2g} mm and "
-            f"{np.degrees(left_rad):.2g}° if {mistake.words}",
-        )
+        varies = f"{mm:.3g} mm and {np.degrees(rad):.3g}° (RMS of {len(seen)} scenes)"
+        fault = f"robot poses and hand-eye: the target's pose in the base varies by {varies}"
+        less = f"{left_mm:.2g} mm and {np.degrees(left_rad):.2g}°"
+        raise InputError("E-LOCATE-VARIES", f"{fault}, but by {less} if {mistake.words}")
 
 
 def _mistakes(mount: Rigid, flange: Poses) -> Iterator[Candidate]:
@@ -263,35 +257,25 @@ def goal_chain(
     needed, the registration is not rigid, or a file does not follow ``data_layout.md``.
     """
     if hand_eye is not None and registration is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"--hand-eye {_named('hand-eye', hand_eye)}, --registration {_named('registration', registration)}: both "
-            "lead to the base; give one",
-        )
+        both = f"--hand-eye {_named('hand-eye', hand_eye)}, --registration {_named('registration', registration)}"
+        raise InputError("E-OPTION-CONFLICT", f"{both}: both lead to the base; give one")
     if hand_eye is None and robot_poses is not None:
         raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
-    if hand_eye is None and registration is None and offset is not None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
-        )
     if hand_eye is None and registration is None:
-        raise InputError(
-            "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
-        )
+        links = "--hand-eye or --registration"
+        if offset is not None:
+            raise InputError("E-OPTION-NEEDS", f"--offset: only with {links}, which lead from the camera to the robot")
+        raise InputError("E-OPTION-MISSING", f"goals: {links} needed, which lead to the robot's base")
     if hand_eye is None:
         moving, mount, source = False, _registered(registration), _named("registration", registration)
     else:
         (moving, mount), source = _mounted(hand_eye, robot_poses), _named("hand-eye", hand_eye)
     if moving and robot_poses is None:
-        raise InputError(
-            "E-OPTION-MISSING",
-            f"{source}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
-        )
+        fault = f"{source}: the camera is on the flange"
+        raise InputError("E-OPTION-MISSING", f"{fault}; robot poses of the scenes (--robot-poses) needed")
     if not moving and robot_poses is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"{source}: the camera is fixed and needs no robot poses; leave --robot-poses out"
-        )
+        fault = f"{source}: the camera is fixed and needs no robot poses"
+        raise InputError("E-OPTION-NEEDS", f"{fault}; leave --robot-poses out")
     if isinstance(offset, str | Path):
         read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
         offset = Rigid.from_matrix(read.obj_from_goal)

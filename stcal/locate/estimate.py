@@ -229,18 +229,15 @@ def locate(
         keep = np.delete(keep, worst)
         if len(outliers) > MAX_OUTLIER_SHARE * len(seen):
             names = ", ".join(str(layout.tags[row][1]) for row in sorted(outliers))
-            raise DegenerateError(
-                "E-LOCATE-CONTRADICTS",
-                f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout "
-                "and camera file belong to the images",
-            )
+            fault = f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names})"
+            remedy = "check that layout and camera file belong to the images"
+            raise DegenerateError("E-LOCATE-CONTRADICTS", f"{fault}; {remedy}")
         problem = all_corners.select((4 * keep[:, None] + np.arange(4)).ravel())
         start = minima.poses[[0]]
     pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
-        raise DegenerateError(
-            "E-LOCATE-OPEN", f"{where}: its tags do not determine the rotation; show more tags, or larger ones"
-        )
+        fault = f"{where}: its tags do not determine the rotation"
+        raise DegenerateError("E-LOCATE-OPEN", f"{fault}; show more tags, or larger ones")
     return pose
 
 
@@ -288,9 +285,8 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
         # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
         if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
             return poses[best]
-    raise DegenerateError(
-        "E-LOCATE-NO-POSE", f"{where}: no pose explains the tags' corners; check layout, camera file and tags"
-    )
+    fault = f"{where}: no pose explains the tags' corners"
+    raise DegenerateError("E-LOCATE-NO-POSE", f"{fault}; check layout, camera file and tags")
 
 
 def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
@@ -372,8 +368,8 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     for e, tags in enumerate(exposures):
         own = [k for k, tag in enumerate(tags.tags) if tag in rows]
         seen = np.searchsorted(used, [rows[tags.tags[k]] for k in own])
-        corners[e, seen], covariance[e, seen] = tags.corners_px[own], tags.covariance_px2[own]
-        joint[e, seen], edge[e, seen] = np.asarray(tags.joint_px2)[own], tags.edge_sigma_px()[own]
+        corners[e, seen], covariance[e, seen] = tags.corners_px[own], tags.corner_covariances_px2()[own]
+        joint[e, seen], edge[e, seen] = tags.joint_px2[own], tags.edge_sigma_px()[own]
     visible = np.isfinite(corners[..., 0, 0])
     # At a right angle, a corner shifts by √2 times the shift of its edges.
     variance = np.trace(covariance, axis1=-2, axis2=-1) + 2 * edge[..., None] ** 2

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.boards.board_designs import UNIT_SQUARE, require_tags
 from stcal.boards.board_designs import TagLayout as TagLayout
-from stcal.boards.board_file import TagsFile, load_tags, require_sizes
+from stcal.boards.board_file import TagsFile, load_tags, placed_corners
 from stcal.boards.dictionaries import known_tags
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
@@ -120,11 +120,9 @@ def load_layout(path: str | Path) -> TargetLayout:
     plan = _plan(data, where)
     open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
     if open_places:
-        raise InputError(
-            "E-TAG-PLACE",
-            f"{where}: tag {open_places[0][1]}: no place; x_mm, y_mm and size_mm or corners_mm needed, "
-            "or the file that `stcal locate calibrate` writes",
-        )
+        fault = f"{where}: tag {open_places[0][1]}: no place"
+        remedy = "x_mm, y_mm and size_mm or corners_mm needed, or the file that `stcal locate calibrate` writes"
+        raise InputError("E-TAG-PLACE", f"{fault}; {remedy}")
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
         corners = in_obj(corners, plan.origin)
@@ -169,28 +167,19 @@ def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plan(data: TagsFile, where: str) -> LayoutPlan:
-    require_sizes(data, where)
-    ids = [tag.id for tag in data.tag]
+    corners, ids = placed_corners(data, where), [tag.id for tag in data.tag]
     repeated = [i for i in ids if ids.count(i) > 1]
     if repeated:
-        raise InputError(
-            "E-TAG-REPEATED",
-            f"{where}: id {repeated[0]} occurs {ids.count(repeated[0])} times; ids must differ, in all families",
-        )
+        fault = f"{where}: id {repeated[0]} occurs {ids.count(repeated[0])} times"
+        raise InputError("E-TAG-REPEATED", f"{fault}; ids must differ, in all families")
     origin = ids[0] if data.origin is None else data.origin
     if origin not in ids:
-        raise InputError(
-            "E-LAYOUT-ORIGIN", f"{where}: origin {origin}: no tag has this id; one of {', '.join(map(str, ids))} needed"
-        )
-    corners = np.full((len(ids), 4, 2), np.nan)
-    for row, tag in enumerate(data.tag):
-        if (place := tag.corners(where)) is None:
-            continue
-        corners[row] = place
-        if np.linalg.det(np.diff(corners[row, :3], axis=0)) <= 0:
-            raise InputError(
-                "E-TAG-CORNERS", f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed"
-            )
+        fault = f"{where}: origin {origin}: no tag has this id"
+        raise InputError("E-LAYOUT-ORIGIN", f"{fault}; one of {', '.join(map(str, ids))} needed")
+    for tag, place in zip(data.tag, corners, strict=True):
+        if np.isfinite(place).all() and np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
+            fault = f"{where}: tag {tag.id}: corners go round the wrong way"
+            raise InputError("E-TAG-CORNERS", f"{fault}; top left, top right, … needed")
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)

@@ -306,20 +306,14 @@ def calibrate(
         else:
             images.append(_image(name, view, detected, listed, rows, camera))
     if len(images) < MIN_IMAGES:
-        raise DegenerateError(
-            "E-LAYOUT-FEW-IMAGES",
-            f"layout: {len(images)} of {len(names)} images show board and tags, {MIN_IMAGES} needed"
-            + (f" ({left_out[0]})" if left_out else ""),
-        )
+        fault = f"layout: {len(images)} of {len(names)} images show board and tags, {MIN_IMAGES} needed"
+        raise DegenerateError("E-LAYOUT-FEW-IMAGES", fault + (f" ({left_out[0]})" if left_out else ""))
     if symmetries:
         images = _turned_alike(images, symmetries)
     seen_rows = np.array(sorted({int(row) for image in images for row in image.rows}))
     if plan.origin not in seen_rows:
-        raise DegenerateError(
-            "E-LAYOUT-UNLINKED",
-            f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images; "
-            "show it, or name another origin in the layout file",
-        )
+        fault = f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images"
+        raise DegenerateError("E-LAYOUT-UNLINKED", f"{fault}; show it, or name another origin in the layout file")
     images = [replace(image, rows=np.searchsorted(seen_rows, image.rows)) for image in images]
     places = np.full((len(images), len(seen_rows), 4, 2), np.nan)  # medians are robust against a misread tag
     for i, image in enumerate(images):
@@ -346,7 +340,7 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
         seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
         np.array([rows[found.tags[k]] for k in own]),
         camera.normalised_from_pixel(found.corners_px[own].reshape(-1, 2)),
-        shift + np.asarray(found.joint_px2)[own],
+        shift + found.joint_px2[own],
         float(camera.focal.mean()),
     )
 
@@ -373,11 +367,9 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
             expected = np.array([place_of_tag[image.rows[k]] for k in common])
             best = int(np.argmin([np.abs(place[common] - expected).sum() for place in places]))
         elif place_of_tag:
-            raise DegenerateError(
-                "E-LAYOUT-UNLINKED",
-                f"layout: {image.name} shares no tag with the other images, and the board looks the same when turned; "
-                "show a tag of another image too, or use a board without symmetry",
-            )
+            fault = f"{image.name} shares no tag with the other images, and the board looks the same when turned"
+            remedy = "show a tag of another image too, or use a board without symmetry"
+            raise DegenerateError("E-LAYOUT-UNLINKED", f"layout: {fault}; {remedy}")
         else:
             best = 0
         turned[i] = choices[best]

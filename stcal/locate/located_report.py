@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from stcal.boards.board_designs import mean_sides
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.cameras.camera_model import CameraModel
@@ -256,7 +257,7 @@ def calibrated_text(result: CalibratedLayout) -> str:
     layout, adjusted = result.layout, result.adjusted
     moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
     sigma = np.sqrt((layout.sigma_mm() ** 2).sum(2).mean(1))
-    side = np.linalg.norm(np.roll(layout.corners_mm, -1, axis=1) - layout.corners_mm, axis=2).mean(1)
+    side = mean_sides(layout.corners_mm)
     rows = []
     for row, (dictionary, tag) in enumerate(layout.tags):
         um = number(1000 * sigma[row], 1), number(1000 * moved[row], 1)

@@ -92,11 +92,9 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     Raises InputError: times that are not positive or not in order, or a count that does not fit them.
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
-        raise InputError(
-            "E-EXPOSURES-VALUE",
-            f"exposures: {count} from {shortest:g} to {longest:g}; two or more, from a positive shortest time to a "
-            "longest that is not shorter, needed",
-        )
+        fault = f"exposures: {count} from {shortest:g} to {longest:g}"
+        remedy = "two or more, from a positive shortest time to a longest that is not shorter, needed"
+        raise InputError("E-EXPOSURES-VALUE", f"{fault}; {remedy}")
     return np.geomspace(shortest, longest, count)
 
 
@@ -109,9 +107,8 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(
-                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(USUAL)} needed"
-            )
+            fault = f"exposures {path}: not an image"
+            raise InputError("E-IMAGE-UNREADABLE", f"{fault}; a folder or one of {', '.join(USUAL)} needed")
         return [SceneFiles(path.stem, (image_file(path),))]
     files, skipped = find_images(path)
     scenes = []
@@ -221,9 +218,8 @@ def capture(
             dark_share=float((image <= DARK).mean()),
         )
         if any(each.image == row.image for each in rows):
-            raise InputError(
-                "E-EXPOSURES-VALUE", f"exposure {exposure:.6g} comes twice; take fewer --count, or a wider range"
-            )
+            fault = f"exposure {exposure:.6g} comes twice"
+            raise InputError("E-EXPOSURES-VALUE", f"{fault}; take fewer --count, or a wider range")
         rows.append(row)
         images.append(image)
         if taken:

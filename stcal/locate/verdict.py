@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.special import chdtri
 
+from stcal.boards.board_designs import mean_sides
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
@@ -56,11 +57,9 @@ class VerdictOptions:
         require_fields(self, "verdict", min_foreshortening=0, equal_deg=0)
         odds = all(0 < value < 1 for value in (self.max_p, self.flip_odds))
         if not (odds and self.sigma_margin >= 1 and self.min_tags >= 1):
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"verdict: odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} "
-                "tags: odds between 0 and 1, a margin and a number of at least 1 needed",
-            )
+            given = f"odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} tags"
+            needed = "odds between 0 and 1, a margin and a number of at least 1 needed"
+            raise InputError("E-OPTION-RANGE", f"verdict: {given}: {needed}")
         for value, unit in ((self.max_sigma_deg, "°"), (self.max_sigma_mm or 0.0, " mm"), (self.min_spread_px, " px")):
             if not 0 <= value < np.inf:
                 raise InputError("E-OPTION-RANGE", f"verdict: limit {value:g}{unit}; a number of at least 0 needed")
@@ -151,8 +150,7 @@ def likely_mistake(
     """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by it as it is."""
     if len(detected) < 2:  # a single tag fits each way round
         return None
-    side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()
-    allowed = FITS * float(side)
+    allowed = FITS * float(mean_sides(detected.corners_px).mean())
     if pose is not None:
         allowed = min(allowed, _misfit_px(detected, layout, camera, pose) / BETTER)
 
@@ -228,11 +226,9 @@ class PatentOptions:
     def __post_init__(self):
         require_fields(self, "patent", min_det_j=0)
         if not (0 <= self.area_share < 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"patent: S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}: "
-                "0 to less than 1, a positive number and 1 or more needed",
-            )
+            given = f"S_dis {self.area_share:g}, E_lim {self.max_error_px:g}, E_ratio {self.min_error_ratio:g}"
+            needed = "0 to less than 1, a positive number and 1 or more needed"
+            raise InputError("E-OPTION-RANGE", f"patent: {given}: {needed}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,10 +309,8 @@ def locate_as_patent(
             figures = (low, high), found.determinant, len(listed[i])
             best = PatentPose(i, tuple(chosen), first, second, *figures, verdict, same=same)
     if best is None:
-        raise DegenerateError(
-            "E-LOCATE-NO-POSE",
-            f"{where}: no pose explains the tags' corners in any exposure; check layout and camera file",
-        )
+        fault = f"{where}: no pose explains the tags' corners in any exposure"
+        raise DegenerateError("E-LOCATE-NO-POSE", f"{fault}; check layout and camera file")
     return replace(best, exposures=tuple(results))
 
 

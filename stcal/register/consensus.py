@@ -74,15 +74,14 @@ RIGID, SIMILARITY, AFFINE = (
 MODELS = {model.name: model for model in (RIGID, SIMILARITY, AFFINE)}
 
 
-def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the linear part (3, 3) and the translation (3,)."""
-    matrix = transform.matrix()
-    return matrix[:3, :3], matrix[:3, 3]
+def linear_part(transform: Transform) -> np.ndarray:
+    """Returns the linear part (3, 3)."""
+    return transform.matrix()[:3, :3]
 
 
 def rotation_of(transform: Transform) -> np.ndarray:
     """Returns the rotation (3, 3) nearest to the linear part."""
-    return best_rotations(parts(transform)[0])[0]
+    return best_rotations(linear_part(transform))[0]
 
 
 def some_of(items: Sequence | np.ndarray, say: Callable[[Any], str]) -> str:
@@ -182,13 +181,17 @@ class Problem:
         covariance = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
         return to_origin @ covariance @ to_origin.T
 
-    def leverages(self, transform: Transform, used: np.ndarray) -> np.ndarray:
-        """Returns H (n, 3, 3) = Lᵀ J N⁻¹ Jᵀ L, P = L Lᵀ: whitened residuals have covariance 1 − H for points that were
-        ``used`` (n,) in the fit, and 1 + H for others. By an eigenvalue of 1, no other point checks this one."""
+    def deletion_squares(self, transform: Transform, used: np.ndarray) -> np.ndarray:
+        """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself (Cook & Weisberg 1982). At unit
+        noise C is 1 − H of points that were ``used`` (n,) in the fit, and 1 + H of others: H = Lᵀ J N⁻¹ Jᵀ L, P = L Lᵀ.
+        By an eigenvalue of H of 1, no other point checks this one."""
         origin = self[used]._middle()
         by_step = jacobian(self.model, transform, self.xyz_a - origin)
         added = by_step @ np.linalg.inv(self[used]._normal(transform, origin)) @ np.swapaxes(by_step, 1, 2)
-        return self.whitened(np.swapaxes(self.whitened(added), 1, 2))
+        leverage = self.whitened(np.swapaxes(self.whitened(added), 1, 2))
+        value, vector = np.linalg.eigh(np.eye(3) + np.where(used, -1.0, 1.0)[:, None, None] * leverage)
+        turned = np.einsum("nij,ni->nj", vector, self.whitened(self.residuals(transform)))
+        return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
     def _middle(self) -> np.ndarray:
         """Returns the weighted mean of a, about which the parameters correlate least."""
@@ -222,9 +225,8 @@ def problem_of(
     name = "weights" if covariances is None else "covariances"
     given = np.asarray(weights if covariances is None else covariances, float)
     if given.shape != (n,) and (name == "weights" or given.shape != (n, 3, 3)):
-        raise InputError(
-            "E-ARRAY-SHAPE", f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed"
-        )
+        found = f"registration: {name} of shape {given.shape} for {n} point pairs"
+        raise InputError("E-ARRAY-SHAPE", f"{found}; one for each needed")
     if given.ndim == 3:
         fault = first_fault(given, OF_POINT, definite=True)
         trouble = fault and f"row {fault.row + 1}: {fault.reason}"
@@ -269,7 +271,7 @@ def _motions(model: Model, transform: Transform) -> np.ndarray:
     """Returns the derivative (12, p) of the 3×4 matrix, row by row, by the parameters."""
     if model == AFFINE:
         return np.eye(12)
-    linear = parts(transform)[0]
+    linear = linear_part(transform)
     motions = np.zeros((model.parameters, 3, 4))
     motions[:3, :, :3] = skew(np.eye(3)) @ linear
     motions[3:6, :, 3] = np.eye(3)
@@ -287,9 +289,8 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
     scale, rigid = (1.0, transform) if isinstance(transform, Rigid) else (transform.scale, transform.rigid)
     scale *= 1 + step[6:].sum()
     if scale <= 0:
-        raise DegenerateError(
-            "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
-        )
+        fault = "registration: the scale is not determined"
+        raise DegenerateError("E-REGISTER-SCALE", f"{fault}; are the covariances true?")
     rotation = Rigid.exp([*step[:3], 0, 0, 0]).rotation @ rigid.rotation
     moved = Rigid(rotation, there + step[3:6] - scale * rotation @ origin)
     return moved if isinstance(transform, Rigid) else Similarity(scale, moved)
@@ -494,22 +495,18 @@ def _consensus(problem: Problem, rng: np.random.Generator) -> Consensus:
             break
         agree = int(found.inliers.sum())
         if model.redundancy(agree) < LEAST_REDUNDANCY:
-            raise DegenerateError(
-                "E-REGISTER-DISAGREE",
-                f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
-                f"{-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more points",
-            )
+            fault = f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform"
+            needed = f"{-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong"
+            raise DegenerateError("E-REGISTER-DISAGREE", f"{fault}, at least {needed}; measure more points")
         rows = rows[found.inliers]
     return Consensus(np.isin(np.arange(len(problem)), rows), 0.0, samples)
 
 
 def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
     within, larger = ("", "") if threshold is None else (f" within {threshold:.4g} mm", ", or give a larger threshold")
-    return DegenerateError(
-        "E-REGISTER-DISAGREE",
-        f"registration: fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}; "
-        f"check the order of the rows and the units{larger}",
-    )
+    fault = f"fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}"
+    remedy = f"check the order of the rows and the units{larger}"
+    return DegenerateError("E-REGISTER-DISAGREE", f"registration: {fault}; {remedy}")
 
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
@@ -549,21 +546,12 @@ def _chosen(
     outside = 3 * sigma**2 * ratio_limit(beyond, 3, redundancy)
     if len(problem) > LEVERAGE_UP_TO:
         return float(np.sqrt(outside)), square <= outside
-    deletion = deletion_squares(problem, transform, used)
+    deletion = problem.deletion_squares(transform, used)
     passed = deletion <= outside
     if redundancy > 3:  # a point that was used is tested against the σ of the others
         rest = np.maximum(redundancy * sigma**2 - deletion[used], 0) / (redundancy - 3)
         passed[used] = deletion[used] <= 3 * ratio_limit(beyond, 3, redundancy - 3) * np.maximum(rest, 1e-300)
     return float(np.sqrt(outside)), passed
-
-
-def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
-    """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise
-    (Cook & Weisberg 1982)."""
-    own = np.where(used, -1.0, 1.0)[:, None, None]
-    value, vector = np.linalg.eigh(np.eye(3) + own * problem.leverages(transform, used))
-    turned = np.einsum("nij,ni->nj", vector, problem.whitened(problem.residuals(transform)))
-    return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
 
 def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -> float:

@@ -16,7 +16,7 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register import consensus
-from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem, Transform, parts
+from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem, Transform, linear_part
 from stcal.register.registered import Registration
 from stcal.row_order import Change, change_along
 
@@ -202,11 +202,8 @@ def check_units(problem: Problem, seed: int) -> None:
     ratio = float(np.median(in_b[apart] / in_a[apart])) if apart.any() else 1.0
     if words := mistaken_unit(ratio):
         small, large = "ab" if ratio > 1 else "ba"
-        raise InputError(
-            "E-REGISTER-UNITS",
-            f"registration: distances in {large} are {max(ratio, 1 / ratio):.4g} times those in {small} (median); "
-            f"{words}",
-        )
+        fault = f"registration: distances in {large} are {max(ratio, 1 / ratio):.4g} times those in {small} (median)"
+        raise InputError("E-REGISTER-UNITS", f"{fault}; {words}")
 
 
 MIRROR_RATIO, MIRROR_CHANCE = 4.0, 1e-4
@@ -258,11 +255,9 @@ def check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thresh
 
 
 def _mirrored(agree: int, count: int, ratio: float) -> InputError:
-    return InputError(
-        "E-REGISTER-MIRRORED",
-        f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit "
-        f"{np.sqrt(ratio):.3g} times better; change the sign of one axis of a or of b, or exchange two",
-    )
+    better = f"mirrored, {agree} of {count} point pairs fit {np.sqrt(ratio):.3g} times better"
+    fault = f"registration: one of the frames is left-handed: {better}"
+    return InputError("E-REGISTER-MIRRORED", f"{fault}; change the sign of one axis of a or of b, or exchange two")
 
 
 SCALE_BY_CHANCE, MATTERS = 1e-4, 0.1
@@ -299,7 +294,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
             narrow, transform_of, sigma = candidate, fitted, float(np.sqrt(max(after, 0) / redundancy))
     if narrow is problem:
         return None
-    scales = np.linalg.svd(parts(transform_of)[0], compute_uv=False)
+    scales = np.linalg.svd(linear_part(transform_of), compute_uv=False)
     if narrow.model == AFFINE:
         said = (
             f"{', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one instrument is "
@@ -329,11 +324,8 @@ def spreads(xyz: np.ndarray) -> np.ndarray:
 
 def by_chance(agreeing: int, n: int, sigma_mm: float) -> DegenerateError:
     """Returns the error of point pairs that agree no better than chance."""
-    return DegenerateError(
-        "E-REGISTER-CHANCE",
-        f"registration: {agreeing} of {n} point pairs agree to {sigma_mm:.4g} mm, no better than chance; check that "
-        "row i of both is the same point",
-    )
+    fault = f"registration: {agreeing} of {n} point pairs agree to {sigma_mm:.4g} mm, no better than chance"
+    return DegenerateError("E-REGISTER-CHANCE", f"{fault}; check that row i of both is the same point")
 
 
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
@@ -342,20 +334,15 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     off_line, root = float(np.hypot(spread[1], spread[2])), np.sqrt(n)
     if n > model.needed and spread[0] < needed:
         raise by_chance(n, n, sigma_mm)
-    if off_line < needed:
-        raise DegenerateError(
-            "E-POINTS-COLLINEAR",
-            f"registration: the {n} points lie along a line, {off_line / root:.4g} mm RMS off it "
-            f"({spread[0] / root:.4g} mm along it); {needed / root:.4g} mm needed at σ {sigma_mm:.4g} mm; measure "
-            "points off the line",
-        )
-    if model == AFFINE and spread[2] < needed:
-        raise DegenerateError(
-            "E-POINTS-COPLANAR",
-            f"registration: the {n} points lie in a plane, {spread[2] / root:.4g} mm RMS off it "
-            f"({spread[0] / root:.4g} mm along it); {needed / root:.4g} mm needed for the affine model at σ "
-            f"{sigma_mm:.4g} mm; measure points off the plane, or use the rigid model",
-        )
+    shapes = [("E-POINTS-COLLINEAR", off_line, "along a line", "", "measure points off the line")]
+    if model == AFFINE:
+        remedy = "measure points off the plane, or use the rigid model"
+        shapes.append(("E-POINTS-COPLANAR", spread[2], "in a plane", " for the affine model", remedy))
+    for code, off, shape, purpose, remedy in shapes:
+        if off < needed:
+            fault = f"the {n} points lie {shape}, {off / root:.4g} mm RMS off it ({spread[0] / root:.4g} mm along it)"
+            least = f"{needed / root:.4g} mm needed{purpose} at σ {sigma_mm:.4g} mm"
+            raise DegenerateError(code, f"registration: {fault}; {least}; {remedy}")
 
 
 def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
@@ -377,10 +364,10 @@ def check_supports(problem: Problem, inliers: np.ndarray, sigma_mm: float) -> No
     alone = single_supports(problem.model, problem.xyz_a[rows], sigma_mm)
     if len(alone):
         kind = "plane" if problem.model == AFFINE else "line"
+        fault = f"only {problem.name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}"
+        wrong = "and any wrong point would fit there as well"
         raise DegenerateError(
-            "E-REGISTER-DEGENERATE",
-            f"registration: only {problem.name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}, "
-            f"and any wrong point would fit there as well; measure more points off the {kind}",
+            "E-REGISTER-DEGENERATE", f"registration: {fault}, {wrong}; measure more points off the {kind}"
         )
 
 

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import OF_POINT, Array, Brief, ByValue, freeze, require_arguments, require_fields, rms
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
-from stcal.register.consensus import Problem, Transform, parts
+from stcal.register.consensus import Problem, Transform, linear_part
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -90,10 +90,9 @@ def read_pairs(path: str | Path | Table, second: str | Path | Table | None = Non
     }
     kinds = [name for name, there in given.items() if there]
     if len(kinds) > 1:
-        raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT",
-            f"{table.where}: columns {' and '.join(kinds)}; only one of weight, sigma_mm, or cov_x_x … cov_z_z needed",
-        )
+        fault = f"{table.where}: columns {' and '.join(kinds)}"
+        remedy = "only one of weight, sigma_mm, or cov_x_x … cov_z_z needed"
+        raise InputError("E-TABLE-COLUMNS-CONFLICT", f"{fault}; {remedy}")
     weights = covariances = None
     if kinds == ["weight"]:
         weights = _positive(table, "weight", table.numbers("weight"))
@@ -102,10 +101,8 @@ def read_pairs(path: str | Path | Table, second: str | Path | Table | None = Non
     elif kinds:
         missing = [name for name in COVARIANCE if name not in table]
         if missing:
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING",
-                f"{table.where}: {missing[0]} is missing; all {len(COVARIANCE)} columns cov_… or none needed",
-            )
+            fault = f"{table.where}: {missing[0]} is missing"
+            raise InputError("E-TABLE-COLUMN-MISSING", f"{fault}; all {len(COVARIANCE)} columns cov_… or none needed")
         covariances = np.empty((len(table), 3, 3))
         i, j = np.triu_indices(3)
         covariances[:, i, j] = covariances[:, j, i] = np.column_stack([table.numbers(name) for name in COVARIANCE])
@@ -252,7 +249,7 @@ class Registration(Brief, Generic[T]):
     @property
     def scales(self) -> np.ndarray:
         """Ratios (3,) of lengths in b to those in a, along the principal axes of the transform."""
-        return np.linalg.svd(parts(self.b_from_a)[0], compute_uv=False)
+        return np.linalg.svd(linear_part(self.b_from_a), compute_uv=False)
 
 
 TRIED = 20_000

@@ -71,10 +71,8 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     """Returns the fit by the paper's method. Raises DegenerateError: too few points, or no sample is acceptable."""
     count, size = len(xyz_a), options.sample
     if count <= size:
-        raise DegenerateError(
-            "E-LIU-SAMPLE",
-            f"liu2017: {count} point pairs, more than the {size} of a sample needed; lower it (--sample)",
-        )
+        fault = f"liu2017: {count} point pairs, more than the {size} of a sample needed"
+        raise DegenerateError("E-LIU-SAMPLE", f"{fault}; lower it (--sample)")
     best, least, most = None, np.inf, 0.0
     tried = False
     for sample, b_from_a, error in orthogonal_samples(xyz_a, xyz_b, options, seed):
@@ -86,12 +84,10 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
             least, best = inside.var(), (b_from_a, error)
     if best is None:
         found = f"at most {100 * most:.0f} %" if tried else "none had an orthogonal 3×3 part"
-        raise DegenerateError(
-            "E-LIU-SAMPLE",
-            f"liu2017: no sample of {size} points leaves more than {100 * options.share:g} % of the others within "
-            f"{options.limit_mm:g} mm in {options.tries} tries ({found}); a larger limit (--threshold-mm), a smaller "
-            "--share, another --sample, or the robust method needed",
-        )
+        wanted = f"more than {100 * options.share:g} % of the others within {options.limit_mm:g} mm"
+        fault = f"liu2017: no sample of {size} points leaves {wanted} in {options.tries} tries ({found})"
+        remedy = "a larger limit (--threshold-mm), a smaller --share, another --sample, or the robust method needed"
+        raise DegenerateError("E-LIU-SAMPLE", f"{fault}; {remedy}")
     b_from_a, error = best
     near = error < options.limit_mm
     return Fitted(b_from_a, near, float(np.sqrt((error[near] ** 2).mean() / 3)), options.limit_mm, options.tries)
@@ -238,12 +234,10 @@ def register(
     if alternative is not None and ambiguous and not allow_ambiguous:
         change = doubts.moved_meanwhile(problem, fitted.transform)
         moved = "" if change is None else f"; {doubts.order_note(change, problem)}"
-        raise DegenerateError(
-            "E-REGISTER-TWO-TRANSFORMS",
-            f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
-            f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
-            f"ambiguous answers{moved}",
-        )
+        others = f"{len(alternative.rows)} others on another, {alternative.apart_mm:.4g} mm from it"
+        fault = f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {others}"
+        remedy = f"register one group of rows alone, or allow ambiguous answers{moved}"
+        raise DegenerateError("E-REGISTER-TWO-TRANSFORMS", f"{fault}; {remedy}")
     covariance, scaled, redundancy = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
     other = shifted = None
     if method != "liu2017":
@@ -279,9 +273,8 @@ def register(
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances, lines) -> Problem:
     a, b = (frozen(xyz, None, f"points of {name}", finite=False) for name, xyz in (("a", xyz_a), ("b", xyz_b)))
     if a.ndim != 2 or a.shape[1:] != (3,) or a.shape != b.shape:
-        raise InputError(
-            "E-ARRAY-SHAPE", f"registration: points of shapes {a.shape} and {b.shape}; (n, 3) twice needed"
-        )
+        fault = f"registration: points of shapes {a.shape} and {b.shape}"
+        raise InputError("E-ARRAY-SHAPE", f"{fault}; (n, 3) twice needed")
     for name, xyz in (("a", a), ("b", b)):
         bad = np.flatnonzero(~np.isfinite(xyz).all(1))
         if len(bad):
@@ -293,14 +286,11 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
         if value not in choices:
             raise InputError(code, f"registration: {name} {value!r}; one of {', '.join(choices)} needed")
     if threshold_mm is not None and not NEAREST_MM <= threshold_mm <= FARTHEST:
-        raise InputError(
-            "E-OPTION-RANGE",
-            f"registration: threshold {threshold_mm:g} mm; a positive number, {NEAREST_MM:g} to {FARTHEST:g}, needed",
-        )
+        fault = f"registration: threshold {threshold_mm:g} mm"
+        raise InputError("E-OPTION-RANGE", f"{fault}; a positive number, {NEAREST_MM:g} to {FARTHEST:g}, needed")
     if method == "liu2017" and (weights is not None or covariances is not None):
-        raise InputError(
-            "E-REGISTER-WEIGHTS", "registration: method liu2017 knows no weights or covariances; leave them out"
-        )
+        fault = "registration: method liu2017 knows no weights or covariances"
+        raise InputError("E-REGISTER-WEIGHTS", f"{fault}; leave them out")
     chosen = MODELS["affine" if method == "liu2017" else model]
     if len(a) < chosen.needed:
         raise DegenerateError(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_designs import black_areas, clear_mm
+from stcal.boards.board_designs import SQUARE, black_areas, clear_mm
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, require_fields
@@ -244,11 +244,9 @@ def _poses(
     half_field_rad = float(np.arctan((size / 2 - border_px) / camera.focal).min())
     reach_mm = float(np.linalg.norm(points - middle, axis=1).max())
     enough_mm = reach_mm / np.sin(half_field_rad) / (1 - options.depth_share)
-    raise InputError(
-        "E-SIMULATE-BODY",
-        f"target {scene.target.name}: no pose at {options.distance_mm:g} mm in which it is in the image and shows two "
-        f"faces; give another --distance: from {enough_mm:.0f} mm on it is in the image",
-    )
+    shown = f"no pose at {options.distance_mm:g} mm in which it is in the image and shows two faces"
+    remedy = f"give another --distance: from {enough_mm:.0f} mm on it is in the image"
+    raise InputError("E-SIMULATE-BODY", f"target {scene.target.name}: {shown}; {remedy}")
 
 
 def _shown_deg(scene: BodyScene, pose: Rigid) -> dict[str, tuple[float, ...]]:
@@ -295,8 +293,7 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarr
     every = np.concatenate([line for area in areas for line in area])
     plate = face.outline_mm
     if plate is None:
-        (left, top), (right, bottom) = every.min(0) - margin, every.max(0) + margin
-        plate = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        plate = every.min(0) - margin + SQUARE * (np.ptp(every, axis=0) + 2 * margin)
     low, high = plate.min(0), plate.max(0)
     px_mm = DRAWING_PX / float((high - low).max())
     width, height = np.ceil((high - low) * px_mm).astype(int).tolist()
@@ -359,7 +356,7 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, FacePicture]) 
         camera_from_face = pose @ scene.target_from_face[face.id]
         drawing = drawings[face.id]
         extent = np.array(drawing.grey.shape[::-1]) / drawing.px_mm
-        corners = drawing.origin + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * extent
+        corners = drawing.origin + SQUARE * extent
         xyz = camera_from_face @ np.pad(corners, ((0, 0), (0, 1)))
         middle = xyz.mean(0)
         inward = -face.outward * camera_from_face.rotation[:, 2]

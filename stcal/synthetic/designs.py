@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.boards.board_designs import TAG_SIGMA_MM, TagLayout
+from stcal.boards.board_designs import TAG_SIGMA_MM, UNIT_SQUARE, TagLayout
 from stcal.boards.dictionaries import dictionary_of, known_tags
 from stcal.boards.target_file import printed_face, tags_on
 from stcal.design import BoardDesign, FaceDesign, TargetDesign
@@ -142,7 +142,6 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
 def _body(name, normals: np.ndarray, distance_mm, tag_mm, dictionary, first_id: int, size_sigma_mm=0.0) -> TargetDesign:
     """Return a body of faces with these outward normals (n, 3), all at one distance from its middle."""
     tag_mm = float(np.round(tag_mm, 3))
-    corners = tag_mm / 2 * np.array([[[-1, -1], [1, -1], [1, 1], [-1, 1]]], float)
     faces: list[FaceDesign] = []
     for k, normal in enumerate(normals):
         z = -normal
@@ -150,7 +149,7 @@ def _body(name, normals: np.ndarray, distance_mm, tag_mm, dictionary, first_id: 
         x = side - (side @ z) * z
         x /= np.linalg.norm(x)
         pose = Rigid(np.column_stack([x, np.cross(z, x), z]), distance_mm * normal)
-        layout = TagLayout(((dictionary, first_id + k),), corners, TAG_SIGMA_MM)
+        layout = TagLayout(((dictionary, first_id + k),), tag_mm * UNIT_SQUARE[None], TAG_SIGMA_MM)
         more = {"rough_target_from_face": pose, "outline_mm": _outline(k, normals, distance_mm, pose)}
         faces.append(printed_face(str(k + 1), layout, TAG_SIGMA_MM, size_sigma_mm, **more))
     return TargetDesign(name, "bright", tuple(faces))

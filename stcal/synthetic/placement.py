@@ -94,12 +94,9 @@ def place_group(
     target_from_board, views, valid = max(places, key=lambda place: len(place[2]))
     if len(valid) < count:
         width, height = np.ptp(shape.outline_board[:, :2], axis=0)
-        raise DegenerateError(
-            "E-SCENE-VIEWS",
-            f"{shape.name}: {len(valid)} of {tried} views show faces and board ({shown} show the faces), "
-            f"{count} needed; take a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm "
-            "(--distance) or a shorter focal length",
-        )
+        fault = f"{len(valid)} of {tried} views show faces and board ({shown} show the faces), {count} needed"
+        remedy = f"take a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm (--distance)"
+        raise DegenerateError("E-SCENE-VIEWS", f"{shape.name}: {fault}; {remedy} or a shorter focal length")
     picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
     return target_from_board, [views.pose(i) for i in valid[picked]]
 

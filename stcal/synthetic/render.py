@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from stcal.boards.board_designs import SQUARE
 from stcal.design import Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
@@ -148,8 +149,7 @@ def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
     n = int(WALL_REACH * view_mm / WALL_CELL_MM)
     row, column = np.mgrid[-n:n, -n:n].reshape(2, -1)
     light = (row + column) % 2 == 0
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    xy = WALL_CELL_MM * (np.column_stack([column, row])[light][:, None] + corners)
+    xy = WALL_CELL_MM * (np.column_stack([column, row])[light][:, None] + SQUARE)
     painter.canvas[:] = round(look.checker[0])
     painter.polygons(wall @ np.dstack([xy, np.zeros(xy.shape[:2])]), look.checker[1])
 
@@ -287,12 +287,9 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
     depth = np.concatenate([image_circles(scene, *view).xyz_camera[:, 2] for view in scene.views()])
     confusion = lens.confusion_px(scene.camera, depth)
     if len(depth) and confusion.max() > WIDEST_PX:
-        raise InputError(
-            "E-SIMULATE-OPTIONS",
-            f"rendering: focused at {lens.focus_mm:g} mm, a circle at {depth[confusion.argmax()]:.0f} mm is blurred "
-            f"to a radius of {confusion.max():.0f} px, at most {WIDEST_PX:g} possible; focus nearer to it, or take a "
-            "larger f-number",
-        )
+        focus = f"rendering: focused at {lens.focus_mm:g} mm, a circle at {depth[confusion.argmax()]:.0f} mm is blurred"
+        fault = f"{focus} to a radius of {confusion.max():.0f} px, at most {WIDEST_PX:g} possible"
+        raise InputError("E-SIMULATE-OPTIONS", f"{fault}; focus nearer to it, or take a larger f-number")
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:

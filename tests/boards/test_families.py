@@ -5,24 +5,23 @@ import numpy as np
 import pytest
 
 from stcal.boards import dictionaries
+from stcal.boards.board_designs import UNIT_SQUARE
 from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of, known_dictionary, of_opencv
 from stcal.boards.tags import find_tags
+from stcal.geometry.plane import apply_homography
 from tests.outcome import fails_with, refuses
+from tests.support.areas import warped
 
 CELLS = {
-    (
-        "tagStandard41h12",
-        0,
-    ): "110111100 000000000 101111100 001111101 001001100 001010101 101111100 000000000 110100100",
-    ("tagStandard41h12", 2114): (
-        "111101111 000000000 001111100 101000100 101000100 001111100 001111100 100000000 001010101"
-    ),
-    ("tagCircle21h7", 37): "000111000 000000000 001111100 001100101 001110101 101011100 001111100 000000000 000100000",
+    ("tagStandard41h12", 0): "1bc 000 17c 07d 04c 055 17c 000 1a4",
+    ("tagStandard41h12", 2114): "1ef 000 07c 144 144 07c 07c 100 055",
+    ("tagCircle21h7", 37): "038 000 07c 065 075 15c 07c 000 020",
 }
-"""Printed tags by family and id, from ``apriltag_to_image`` of AprilTag 3: 1 is white, the white ring 5 cells wide."""
+"""Printed tags by family and id, from ``apriltag_to_image`` of AprilTag 3, in rows of nine bits: 1 is white,
+the white ring 5 cells wide."""
 RING = 5
-SHARPER, PER_CELL = 8, 16
+PER_CELL = 16
 LAYOUT = """type = "tags"
 tag = [{ dictionary = "TagStandard41h12", id = 3, size_mm = 40, x_mm = 0, y_mm = 0 }]
 """
@@ -30,23 +29,17 @@ tag = [{ dictionary = "TagStandard41h12", id = 3, size_mm = 40, x_mm = 0, y_mm =
 
 def view_of_tag(tag: tuple[str, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    cells = 255 * np.array([list(row) for row in CELLS[tag].split()]).astype(np.uint8)
+    cells = 255 * np.array([[int(bit) for bit in f"{int(row, 16):09b}"] for row in CELLS[tag].split()], np.uint8)
     sheet = np.kron(np.pad(cells, 1, constant_values=255), np.ones((PER_CELL, PER_CELL), np.uint8))
     cell_px, angle = rng.uniform(5.5, 12), rng.uniform(0, 2 * np.pi)
     across = cell_px * np.array([np.cos(angle), np.sin(angle)])
     down = cell_px * rng.uniform(0.7, 1) * np.array([-np.sin(angle), np.cos(angle)])
     image_from_cells = np.column_stack([np.append(c, rng.uniform(-0.01, 0.01)) for c in (across, down)])
     image_from_cells = np.column_stack([image_from_cells, [*(90 + rng.uniform(size=2)), 1]])
-    middle = sheet.shape[0] / PER_CELL / 2
-    cells_from_sheet = np.array([[1, 0, 0.5 - middle * PER_CELL], [0, 1, 0.5 - middle * PER_CELL], [0, 0, PER_CELL]])
-    fine = np.array([[SHARPER, 0, (SHARPER - 1) / 2], [0, SHARPER, (SHARPER - 1) / 2], [0, 0, 1.0]])
-    size = (180 * SHARPER,) * 2
-    seen = cv2.warpPerspective(sheet, fine @ image_from_cells @ cells_from_sheet, size, borderValue=255)
-    seen = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 0.6 * SHARPER), (180, 180), interpolation=cv2.INTER_AREA)
-    image = np.clip(0.75 * seen + 25 + rng.normal(0, 1.5, seen.shape), 0, 255).astype(np.uint8)
-    half = RING / 2
-    corners = np.array([[-half, -half, 1], [half, -half, 1], [half, half, 1], [-half, half, 1]]) @ image_from_cells.T
-    return image, corners[:, :2] / corners[:, 2:]
+    first = 0.5 - len(sheet) / 2
+    cells_from_sheet = np.array([[1, 0, first], [0, 1, first], [0, 0, PER_CELL]])
+    image = warped(sheet, image_from_cells @ cells_from_sheet, (180, 180), rng, 0.6, (25.0, 216.0), 1.5)
+    return image, apply_homography(image_from_cells, RING * UNIT_SQUARE)
 
 
 @pytest.mark.parametrize("tag", CELLS)
@@ -59,7 +52,7 @@ def test_tags_of_other_families_have_their_corners_and_sigma(tag):
         assert tags.tags == (tag,)
         off = tags.corners_px[0] - corners
         assert np.abs(off).max() < 0.1
-        squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(tags.covariance_px2[0]), off) / 2)
+        squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(tags.corner_covariances_px2()[0]), off) / 2)
     assert 0.4 < np.mean(squares) < 2.5  # 24 corners, and the four of a tag share its edges
 
 

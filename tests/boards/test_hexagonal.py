@@ -19,8 +19,11 @@ TEXT = 'type = "hexagonal-circles"\nrows = 9\ncolumns = 8\nspacing_mm = 20.0\nra
 TILTS = [(0.0, 0.0, 0.1), (0.5, 0.0, 0.3), (0.0, 0.6, -1.2), (0.3, -0.4, 2.5)]
 
 
-def view_of(board: HexagonalCirclesDesign, tilt, hidden_from_mm=(np.inf, np.inf)) -> tuple[np.ndarray, Rigid]:
-    """A grey image, and camera_from_board; what lies beyond ``hidden_from_mm`` along X and Y is covered."""
+def view_of(
+    board: HexagonalCirclesDesign, tilt, hidden_from_mm=(np.inf, np.inf), hole: float = 0.4
+) -> tuple[np.ndarray, Rigid]:
+    """A grey image, and camera_from_board; what lies beyond ``hidden_from_mm`` along X and Y is covered. Rings have a
+    hole of ``hole`` times their radius."""
     xy = board.xy_mm()
     turn = Rigid.exp([*tilt, 0, 0, 0]).rotation
     middle = np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
@@ -30,7 +33,10 @@ def view_of(board: HexagonalCirclesDesign, tilt, hidden_from_mm=(np.inf, np.inf)
     normal = turn[:, 2]
     met = ((rays * (normal @ pose.translation / (rays @ normal))[:, None]) - pose.translation) @ turn
     on_board = ((met[:, :2] > xy.min(0) - MARGIN_MM) & (met[:, :2] < xy.max(0) + MARGIN_MM)).all(1)
-    grey = np.where(on_board & (cKDTree(xy).query(met[:, :2])[0] > board.radius_mm), 220.0, 40.0)
+    away, nearest = cKDTree(xy).query(met[:, :2], distance_upper_bound=1.01 * board.radius_mm)
+    in_hole = np.isin(nearest, [row * board.columns + place for row, place in board.rings])
+    in_hole &= away < hole * board.radius_mm
+    grey = np.where(on_board & ((away > board.radius_mm) | in_hole), 220.0, 40.0)
     grey[(met[:, :2] > hidden_from_mm).all(1)] = 130.0
     small = cv2.resize(grey.reshape(x.shape), (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
     noise = np.random.default_rng(0).normal(0, 1.5, small.shape)
@@ -95,12 +101,27 @@ def test_a_view_has_its_circles_where_they_are(rows, tilt):
     assert 0.4 < in_sigma.mean() < 2.5
 
 
-def test_a_covered_corner_is_no_harm():
-    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
-    image, pose = view_of(board, TILTS[1], (100.0, 80.0))
+END_RINGS, COLUMN_RINGS = ((1, 2), (1, 3), (4, 6)), ((2, 1), (5, 3))
+
+
+@pytest.mark.parametrize(
+    ("rows", "rings", "hole", "tilt", "hidden_from_mm", "least", "most"),
+    [
+        (9, (), 0.4, TILTS[1], (100.0, 80.0), 56, 67),  # a covered corner is no harm
+        (9, COLUMN_RINGS, 0.4, TILTS[1], (112.0, -np.inf), 41, 55),  # rings tell which columns are seen
+        *sampled(
+            [(8, END_RINGS, share, tilt, (np.inf, np.inf), 61, 64) for share in (0.35, 0.6) for tilt in TILTS[1:]],
+            kept=(2,),
+        ),  # an even number of rows looks the same turned, but for its rings
+    ],
+)
+def test_covered_boards_and_rings_are_numbered_as_they_are(rows, rings, hole, tilt, hidden_from_mm, least, most):
+    board = HexagonalCirclesDesign(rows, 8, 20.0, 6.0, "dark", rings=rings)
+    image, pose = view_of(board, tilt, hidden_from_mm, hole)
     view, why = find_board(image, "a", CAMERA, board)
     assert view is not None, why
-    assert 55 < len(view) < 68
+    assert board.symmetries() == []
+    assert least <= len(view) <= most
     assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
 
 
@@ -110,37 +131,3 @@ def test_a_covered_strip_is_said():
     view, why = find_board(view_of(board, TILTS[1], (112.0, -np.inf))[0], "a", CAMERA, board)
     assert view is None
     assert "strip of the board is hidden" in why
-
-
-def with_holes(board: HexagonalCirclesDesign, rings, share: float, tilt, hidden_from_mm=(np.inf, np.inf)):
-    """A view with holes, ``share`` of the radius, in the circles ``rings``, (row, place)."""
-    image, pose = view_of(board, tilt, hidden_from_mm)
-    fine, angle = cv2.resize(image, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC), np.linspace(0, 2 * np.pi, 100)
-    rim = share * board.radius_mm * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    for row, place in rings:
-        px = CAMERA.project(pose @ (np.append(board.xy_mm()[row * board.columns + place], 0.0) + rim))
-        cv2.fillPoly(fine, [np.rint(((px + 0.5) * 8 - 0.5) * 16).astype(np.int32)], 220, cv2.LINE_AA, 4)
-    return cv2.resize(fine, image.shape[::-1], interpolation=cv2.INTER_AREA), pose
-
-
-@pytest.mark.parametrize(("share", "tilt"), sampled([(s, t) for s in (0.35, 0.6) for t in TILTS[1:]], kept=(2,)))
-def test_rings_tell_the_ends_of_a_board(share, tilt):
-    """The board has an even number of rows and looks the same turned, but for its rings."""
-    rings = ((1, 2), (1, 3), (4, 6))
-    board = HexagonalCirclesDesign(8, 8, 20.0, 6.0, "dark", rings=rings)
-    image, pose = with_holes(board, rings, share, tilt)
-    view, why = find_board(image, "a", CAMERA, board)
-    assert view is not None, why
-    assert board.symmetries() == []
-    assert len(view) >= 61
-    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
-
-
-def test_rings_tell_which_columns_are_seen():
-    rings = ((2, 1), (5, 3))
-    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark", rings=rings)
-    image, pose = with_holes(board, rings, 0.4, TILTS[1], (112.0, -np.inf))
-    view, why = find_board(image, "a", CAMERA, board)
-    assert view is not None, why
-    assert 40 < len(view) < 56
-    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06

@@ -14,18 +14,13 @@ from tests.outcome import fails_with, refuses
 
 ROUNDED_MM = 1e-9
 """Lengths are written with nine decimals: half a unit of the last is 5e-10 mm."""
-CIRCLES = """\
-  { id = "1", x_mm = 0, y_mm = 0, radius_mm = 8 },
-  { id = "2", x_mm = 40, y_mm = 0, radius_mm = 8 },
-  { id = "3", x_mm = 0, y_mm = 40, radius_mm = 8 },
-  { id = "4", x_mm = 40, y_mm = 40, radius_mm = 4 },
-"""
-CIRCLES_OF_60 = """\
-  { id = "1", x_mm = 0, y_mm = 0, radius_mm = 12 },
-  { id = "2", x_mm = 60, y_mm = 0, radius_mm = 12 },
-  { id = "3", x_mm = 0, y_mm = 60, radius_mm = 12 },
-  { id = "4", x_mm = 60, y_mm = 60, radius_mm = 6 },
-"""
+CIRCLES, CIRCLES_OF_60 = (
+    "".join(
+        f'  {{ id = "{k}", x_mm = {x * side}, y_mm = {y * side}, radius_mm = {radius} }},\n'
+        for k, x, y, radius in ((1, 0, 0, large), (2, 1, 0, large), (3, 0, 1, large), (4, 1, 1, large // 2))
+    )
+    for side, large in ((40, 8), (60, 12))
+)
 HEAD = 'name = "t"\npolarity = "bright"\n'
 FACE = f'[[face]]\nid = "1"\norigin = "1"\nx = "2"\ny = "3"\ncircles = [\n{CIRCLES}]\n'
 FACE_OF_60 = FACE.replace(CIRCLES, CIRCLES_OF_60).replace('[[face]]\nid = "1"', '[[face]]\nid = "2"')

@@ -20,8 +20,7 @@ from stcal.boards.board_designs import (
     TagLayout,
 )
 from stcal.boards.board_file import board_toml
-from stcal.boards.finders import find_charuco, find_chessboard
-from stcal.boards.tags import find_aprilgrid, find_tags
+from stcal.boards.finders import find_on_faces
 from stcal.boards.target_file import target_toml
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.drawing.draw import (
@@ -42,6 +41,7 @@ from stcal.drawing.parts import Disc, Outline, Text, _is_clear, net_part, parts_
 from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.geometry.plane import apply_homography
 from stcal.geometry.rigid import Rigid
+from stcal.labels import BOARD
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
@@ -62,13 +62,8 @@ def shapes_of(sheet) -> list:
     return [*sheet.shapes, *sheet.furniture]
 
 
-def page_image(sheet) -> np.ndarray:
-    """The page, grey, as it is printed: pixels ``PER_MM`` a millimetre."""
-    return pages_of(pdf([sheet]))[0]
-
-
 def pages_of(content: bytes) -> list[np.ndarray]:
-    """Pages of a PDF as another program draws them, grey."""
+    """Pages of a PDF as another program draws them, grey: pixels ``PER_MM`` a millimetre."""
     scale, pages = PER_MM * POINT_MM, []
     for page in PdfDocument(content):
         whole = np.ceil(np.array(page.get_size()) * scale - 1e-3)  # else the page is stretched to whole pixels
@@ -91,17 +86,6 @@ def camera_of(image: np.ndarray) -> Camera:
     return Camera(width, height, [focal, focal], [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
 
-def obliquely(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """The page turned about a slanted axis; the homography from its image, and the camera."""
-    camera = camera_of(image)
-    matrix = np.array([[camera.focal[0], 0, camera.centre[0]], [0, camera.focal[1], camera.centre[1]], [0, 0, 1]])
-    turn = cv2.Rodrigues(OBLIQUE_RAD * np.array([0.6, 0.8, 0.0]))[0]
-    turn[:, 2] = [0, 0, 1.0]  # the plane's points x, y at depth 1: columns 1 and 2 of the turn, then the shift
-    homography = matrix @ turn @ np.linalg.inv(matrix)
-    seen = cv2.warpPerspective(cv2.GaussianBlur(image, (0, 0), 0.7), homography, image.shape[::-1], borderValue=255)
-    return seen, homography, camera
-
-
 CIRCLE_PX, CORNER_PX = 0.1, 0.3
 """How well centres and corners are found again in an image without noise, blurred a little: edges of 8-bit pixels, and
 of the oblique ones twice interpolated."""
@@ -118,9 +102,15 @@ def rims_px(sheet, page) -> dict[str, np.ndarray]:
 
 
 def seen_ways(image, places):
-    """The image, where ``places`` of the page are in it, and the camera; from the front and obliquely."""
-    yield image, places, camera_of(image)
-    seen, homography, camera = obliquely(image)
+    """The image, where ``places`` of the page are in it, and the camera; from the front, and turned about a slanted
+    axis."""
+    camera = camera_of(image)
+    yield image, places, camera
+    matrix = camera.to_opencv()[0]
+    turn = cv2.Rodrigues(OBLIQUE_RAD * np.array([0.6, 0.8, 0.0]))[0]
+    turn[:, 2] = [0, 0, 1.0]  # the plane's points x, y at depth 1: columns 1 and 2 of the turn, then the shift
+    homography = matrix @ turn @ np.linalg.inv(matrix)
+    seen = cv2.warpPerspective(cv2.GaussianBlur(image, (0, 0), 0.7), homography, image.shape[::-1], borderValue=255)
     yield seen, {name: apply_homography(homography, xy) for name, xy in places.items()}, camera
 
 
@@ -144,7 +134,7 @@ def test_faces_are_read_back(target: TargetDesign, tmp_path):
 def test_dots_are_read_back():
     board = BoardDesign(5, 7, 12.0, 3.0, "bright", 0.005, (0, 6), 4.5)
     sheet = one_sheet(parts_of(board, 10.0), "board")
-    page = page_image(sheet)
+    page = pages_of(pdf([sheet]))[0]
     for image, rims, camera in seen_ways(page, rims_px(sheet, page)):
         detection = detect_image(image, camera, reference_target(), board, EllipseOptions())
         (sighting,) = detection.boards
@@ -180,23 +170,12 @@ BOARDS = {
 def test_squares_and_tags_are_read_back(board):
     (part,) = parts_of(board, 10.0)
     sheet = one_sheet([part], "board")
-    page = page_image(sheet)
+    page = pages_of(pdf([sheet]))[0]
     for image, places, camera in seen_ways(page, {"": points_px(sheet, part, board, page)}):
         xy = places[""]
-        if isinstance(board, ChessboardDesign):
-            view = find_chessboard(image, "page", board)
-        elif isinstance(board, CharucoDesign):
-            view = find_charuco(image, "page", board)
-        elif isinstance(board, AprilGridDesign):
-            view, _ = find_aprilgrid(image, "page", board, camera)
-        else:
-            tags = find_tags(image, ["DICT_5X5_50"])
-            assert tags.tags == board.tags
-            assert np.linalg.norm(tags.corners_px.reshape(-1, 2) - xy, axis=1).max() < CORNER_PX
-            continue
-        assert view is not None
-        assert len(view) == len(xy)
-        assert np.linalg.norm(view.xy_px - xy[view.ids], axis=1).max() < CORNER_PX
+        views, _ = find_on_faces(image, "page", {BOARD: board}, camera)
+        assert len(views[BOARD]) == len(xy)
+        assert np.linalg.norm(views[BOARD].xy_px - xy[views[BOARD].ids], axis=1).max() < CORNER_PX
 
 
 def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
@@ -412,7 +391,7 @@ def test_plates_meet_in_the_net_as_they_do_in_space(target):
 
 def test_all_faces_are_read_from_the_net(target):
     sheet = one_sheet([net_part(target)], "net")
-    image = page_image(sheet)
+    image = pages_of(pdf([sheet]))[0]
     found = detect_image(image, camera_of(image), target, None, EllipseOptions())
     assert sorted(each.face for each in found.faces) == sorted(face.id for face in target.faces)
     assert all(len(each.circles) == 9 for each in found.faces)

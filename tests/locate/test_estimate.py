@@ -1,6 +1,7 @@
 """Poses from simulated corners: covariance, branches, tags that are wrong; and the published steps, each for itself."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def with_wrong_tag(rows: list[int], row: int) -> SeenTags:
     tags = simulated_exposures(LAYOUT, truth, np.random.default_rng(0), shown=(rows,))[0]
     corners = np.array(tags.corners_px)
     corners[rows.index(row)] += [40.0, -25.0]
-    return merge([Tags(tags.tags, corners, tags.covariance_px2)], LAYOUT).seen
+    return merge([Tags(tags.tags, corners, tags.joint_px2)], LAYOUT).seen
 
 
 def test_a_wrong_tag_is_left_out():
@@ -142,11 +143,10 @@ def test_shared_errors_do_not_average_out():
     truth = Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0])
     exact = example_layout(1e-6)
     sigma = {}
-    for shared in (0.0, 1.0):
-        for count in (1, 9):
-            rng = np.random.default_rng(4)
-            seen = merge(simulated_exposures(exact, truth, rng, CornerNoise(0.3, shared), (SIX,) * count), exact).seen
-            sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=1, axis2=2).mean() / 8)
+    for shared, count in product((0.0, 1.0), (1, 9)):
+        rng = np.random.default_rng(4)
+        seen = merge(simulated_exposures(exact, truth, rng, CornerNoise(0.3, shared), (SIX,) * count), exact).seen
+        sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=1, axis2=2).mean() / 8)
     assert sigma[0.0, 9] / sigma[0.0, 1] == pytest.approx(1 / 3, rel=0.1)
     assert sigma[1.0, 9] / sigma[1.0, 1] == pytest.approx(1, rel=0.1)
 
@@ -178,21 +178,17 @@ def test_selection_by_number_and_area():
 
 def test_the_exposure_with_the_smallest_error_is_kept():
     rng = np.random.default_rng(0)
-    coarse = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.5, 0.0))[0]
-    fine = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.01, 0.0))[0]
-    few = simulated_exposures(EXACT, TRUTH, rng, CornerNoise(0.0, 0.0), ((0, 1),))[0]
-    found = locate_as_patent([coarse, fine, few], EXACT, CAMERA, PatentOptions())
-    assert found.exposure == 1
-    assert found.candidates == (0, 1)
-    assert [(each.tags, each.candidate, each.poses is None) for each in found.exposures] == [
-        (len(EXACT.tags), True, False),
-        (len(EXACT.tags), True, False),
-        (2, False, True),
+    coarse_fine_few = [
+        simulated_exposures(EXACT, TRUTH, rng, CornerNoise(sigma_px, 0.0), (shown,))[0]
+        for sigma_px, shown in ((0.5, SIX), (0.01, SIX), (0.0, (0, 1)))
     ]
-    assert found.exposures[1].errors_px == found.errors_px
-    assert found.exposures[0].errors_px[0] > found.errors_px[0]
-    assert found.exposures[1].det_j == found.det_j
-    assert found.exposures[2].area_px2 is None
+    found = locate_as_patent(coarse_fine_few, EXACT, CAMERA, PatentOptions())
+    assert (found.exposure, found.candidates) == (1, (0, 1))
+    coarse, fine, few = found.exposures
+    assert [(each.tags, each.candidate) for each in found.exposures] == [(6, True), (6, True), (2, False)]
+    assert (fine.errors_px, fine.det_j) == (found.errors_px, found.det_j)
+    assert coarse.errors_px[0] > found.errors_px[0]
+    assert few.area_px2 is few.poses is None
     assert (found.camera_from_obj @ TRUTH.inverse()).angle_rad() < np.radians(0.2)
     assert found.verdict.decision == "accept"
 
@@ -221,9 +217,9 @@ def test_a_pose_that_fits_exactly_has_a_ratio_and_none_is_named(monkeypatch):
 
     flat = np.pad(EXACT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
     corners = CAMERA.project(TRUTH @ flat).reshape(-1, 4, 2)
-    exact = Tags(EXACT.tags, corners, np.tile(np.eye(2), (len(corners), 4, 1, 1)))
+    exact = Tags(EXACT.tags, corners, np.tile(np.eye(8), (len(corners), 1, 1)))
     assert locate_as_patent([exact], EXACT, CAMERA, PatentOptions()).verdict.decision == "accept"
-    empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
+    empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)))
     refuses("E-LOCATE-NO-TAG", locate_as_patent, [empty], EXACT, CAMERA, PatentOptions())
     monkeypatch.setattr("stcal.locate.verdict.poses_of_plane", refuse)
     refuses("E-LOCATE-NO-POSE … in any exposure", locate_as_patent, [exact], EXACT, CAMERA, PatentOptions())

@@ -96,7 +96,7 @@ def views(count: int, seed: int, corner_px: float = 0.0, tag_px: float = 0.0, st
         pixels = CAMERA.project(pose @ xyz) + BOARD_PX * rng.standard_normal((len(xyz), 2))
         boards.append(view_of(f"{i}", BOARD, np.arange(len(xyz)), pixels))
         ideal = CAMERA.project(pose @ (BOARD_FROM_OBJ @ FLAT)).reshape(-1, 4, 2)
-        covariance = np.tile(CORNER_PX**2 * np.eye(2), (6, 4, 1, 1))
+        covariance = np.tile(CORNER_PX**2 * np.eye(8), (6, 1, 1))
         own = Tags(LAYOUT.tags, ideal, covariance)
         edge = (own.edge_sigma_px() * rng.standard_normal(6))[:, None, None] * corners_by_edges(ideal)
         noise = np.hypot(CORNER_PX, corner_px) * rng.standard_normal(ideal.shape)
@@ -157,7 +157,7 @@ def test_a_board_numbered_from_its_other_end_is_turned_back():
         ids = np.arange(len(xyz))
         boards.append(view_of(f"{i}", board, ids[::-1] if i in (1, 4) else ids, CAMERA.project(pose @ xyz)))
         ideal = CAMERA.project(pose @ (BOARD_FROM_OBJ @ FLAT)).reshape(-1, 4, 2)
-        tags.append(Tags(LAYOUT.tags, ideal, np.tile(1e-4 * np.eye(2), (6, 4, 1, 1))))
+        tags.append(Tags(LAYOUT.tags, ideal, np.tile(1e-4 * np.eye(8), (6, 1, 1))))
     names = [view.image for view in boards]
     result = calibrate(PLAN, boards, tags, names, CAMERA, board.symmetries())
     assert np.abs(result.layout.corners_mm - LAYOUT.corners_mm).max() < 1e-3
@@ -174,7 +174,7 @@ def test_obj_lies_where_it_is_on_the_board_and_a_misread_tag_moves_little():
     assert off.angle_rad() < 5e-3
     corners = np.array(tags[3].corners_px)
     corners[2] += 80.0
-    tags[3] = Tags(tags[3].tags, corners, tags[3].covariance_px2)
+    tags[3] = Tags(tags[3].tags, corners, tags[3].joint_px2)
     bad = calibrate(PLAN, boards, tags, names, CAMERA)
     sigma = good.layout.sigma_mm()[2].max()
     assert np.abs(bad.layout.corners_mm - good.layout.corners_mm)[2].max() < 2 * sigma
@@ -183,7 +183,7 @@ def test_obj_lies_where_it_is_on_the_board_and_a_misread_tag_moves_little():
 def test_what_cannot_be_calibrated_is_named():
     boards, tags, names = views(3, 0)
     refuses("E-LAYOUT-FEW-IMAGES … 1 … 3 … 2", calibrate, PLAN, [boards[0], None, None], tags, names, CAMERA)
-    without = [Tags(t.tags[1:], t.corners_px[1:], t.covariance_px2[1:]) for t in tags]
+    without = [Tags(t.tags[1:], t.corners_px[1:], t.joint_px2[1:]) for t in tags]
     refuses("E-LAYOUT-UNLINKED … 0 … 3", calibrate, PLAN, boards, without, names, CAMERA)
     result = calibrate(PLAN, [*boards, None], [*tags, tags[0]], [*names, "bare.png"], CAMERA)
     assert result.left_out == ("bare.png: the board is not seen",)

@@ -52,13 +52,18 @@ def error_of(result, truth: Rigid = TRUTH) -> np.ndarray:
     return Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))[0]
 
 
+def assert_true(result, truth: Rigid = TRUTH) -> None:
+    """Accepted, and off by what chance exceeds once in a thousand (6 degrees of freedom)."""
+    assert result.verdict.decision == "accept"
+    error = error_of(result, truth)
+    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
+
+
 def test_one_image(located, plain):
     result = located([plain])
-    assert result.verdict.decision == "accept"
     assert len(result.pose.rows) == 6
-    error = error_of(result)
-    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5  # one in a thousand (6 degrees of freedom)
-    assert np.linalg.norm(error[:3]) < np.radians(0.2)
+    assert_true(result)
+    assert np.linalg.norm(error_of(result)[:3]) < np.radians(0.2)
 
 
 def test_exposures_together_find_what_none_finds_alone(located, plain):
@@ -75,9 +80,7 @@ def test_exposures_together_find_what_none_finds_alone(located, plain):
 def test_an_over_exposed_target_keeps_its_place(located, plain):
     """Saturation draws all edges inwards: what looks like a smaller tag is one σ of the depth, not ten."""
     result = located(expose(plain, [4.0]))
-    assert result.verdict.decision == "accept"
-    error = error_of(result)
-    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
+    assert_true(result)
 
 
 def test_tags_of_another_target_are_named(seen, plain):
@@ -201,10 +204,7 @@ def two_tags():
 
 def test_an_array_is_located(two_tags):
     camera = CameraModel((500, 500), (159.5, 119.5), np.zeros(8), "PINHOLE", 320, 240, "")
-    result = locate_image(two_tags, TWO, camera)
-    assert result.verdict.decision == "accept"
-    error = Poses.of([result.pose.camera_from_obj]).difference(Poses.of([PLACE]))[0]
-    assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5  # one in a thousand (6 degrees of freedom)
+    assert_true(locate_image(two_tags, TWO, camera), PLACE)
 
 
 def test_colour_and_depth_of_an_array_do_not_matter(two_tags):

@@ -99,26 +99,26 @@ def lengths():
 @pytest.mark.parametrize("scale", [1.5, 1.0002])
 def test_another_scale_is_named_with_its_sigma(scale):
     a, b, noise = lengths()
-    notes = register(a, scale * b + noise).notes
+    notes = register(a, scale * b + noise, folds=0).notes
     (note,) = notes  # neither bent nor in a plane
     found, sigma = (float(note.split()[at]) for at in (4, 6))
     # σ of a scale: of a coordinate over the root of the square sum of the coordinates about their mean.
     assert sigma == pytest.approx(0.05 / np.sqrt(((a - a.mean(0)) ** 2).sum()), rel=0.3)
     assert abs(found - scale) < 4 * sigma
     assert "use --model similarity" in note
-    assert register(a, scale * b + noise, model="similarity").notes == ()
+    assert register(a, scale * b + noise, model="similarity", folds=0).notes == ()
 
 
 def test_an_axis_that_is_scaled_is_told_from_a_scale_and_a_bend_is_said_beside_it():
     a, b, noise = lengths()
-    (note,) = register(a, (b - b.mean(0)) * [1.0, 1.0, 1.01] + noise).notes
+    (note,) = register(a, (b - b.mean(0)) * [1.0, 1.0, 1.01] + noise, folds=0).notes
     assert "lengths in b are 1.01" in note
     assert "along three axes" in note
     bent = 2.0 * np.sin(a[:, [1, 2, 0]] / 60.0)
-    notes = register(a, 1.01 * b + bent + noise).notes
+    notes = register(a, 1.01 * b + bent + noise, folds=0).notes
     assert any("lengths in b" in note for note in notes)
     assert any("the frames are bent" in note for note in notes)
-    assert register(a, a).notes == register(a, b).notes == ()
+    assert register(a, a, folds=0).notes == register(a, b, folds=0).notes == ()
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def written(folder, text):
 def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
     board = load_board(written(tmp_path, board_toml(CIRCLES.lattice())))
     assert isinstance(board, LatticePart)
-    assert board.circles == CIRCLES
+    assert board.printed == CIRCLES
     xy = board.xy_mm()
     assert len(board.labels()) == len(board.radii_mm()) == len(xy) == 55
     # Neighbours' distances are those of OpenCV's documented layout.

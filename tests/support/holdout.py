@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from stcal.boards.tags import Tags, corner_blocks
+from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
 from stcal.geometry.rigid import Poses, Rigid
@@ -83,7 +83,7 @@ def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayo
     name, rows, sigma = images.names[i], tuple(int(row) for row in part.rows), np.inf
     try:
         if isinstance(options, PatentOptions):
-            tags = Tags(tuple(layout.tags[row] for row in rows), part.corners_px, corner_blocks(part.covariance_px2))
+            tags = Tags(tuple(layout.tags[row] for row in rows), part.corners_px, part.covariance_px2)
             found = locate_as_patent([tags], layout, images.camera, options)
             pose, verdict = found.camera_from_obj, found.verdict
         else:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Affine, Rigid
-from stcal.register.consensus import Transform, parts
+from stcal.register.consensus import Transform
 
 SIGMA_MM = 0.15
 HALF_MM = 100.0
@@ -93,7 +93,9 @@ def scene(seed, *args, **options) -> PointPairScene:
 
 def parameter_error(found: Transform, truth: Transform) -> np.ndarray:
     """The step (p,) from truth to found: that of :meth:`~stcal.register.consensus.Problem.unit_covariance`."""
-    (linear, translation), (true_linear, true_translation) = parts(found), parts(truth)
+    (linear, translation), (true_linear, true_translation) = (
+        (matrix[:3, :3], matrix[:3, 3]) for matrix in (found.matrix(), truth.matrix())
+    )
     if not isinstance(found, Affine):
         scale = np.cbrt(np.linalg.det(linear) / np.linalg.det(true_linear))
         turn = Rotation.from_matrix(linear @ np.linalg.inv(true_linear) / scale).as_rotvec()

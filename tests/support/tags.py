@@ -69,12 +69,12 @@ def simulated_exposures(
     common = noise.sigma_px * np.sqrt(noise.shared) * rng.standard_normal(ideal.shape)
     common += layout.sigma_px * rng.standard_normal(ideal.shape)
     common += layout.tag_sigma_px * rng.standard_normal((n, 1, 2))
-    edge_sigma = Tags(layout.tags, ideal, np.zeros((n, 4, 2, 2))).edge_sigma_px()
+    edge_sigma = Tags(layout.tags, ideal, np.zeros((n, 8, 8))).edge_sigma_px()
     common += (edge_sigma * rng.standard_normal(n))[:, None, None] * corners_by_edges(ideal)
     found = []
     for rows in map(list, shown):
         own = noise.sigma_px * np.sqrt(1 - noise.shared) * rng.standard_normal((len(rows), 4, 2))
-        covariance = np.tile(noise.sigma_px**2 * np.eye(2), (len(rows), 4, 1, 1))
+        covariance = np.tile(noise.sigma_px**2 * np.eye(8), (len(rows), 1, 1))
         tags = tuple(layout.tags[row] for row in rows)
         found.append(Tags(tags, ideal[rows] + common[rows] + own, covariance))
     return found

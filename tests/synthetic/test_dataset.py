@@ -111,13 +111,13 @@ def test_refusals(tmp_path, scene):
     refuses("E-OPTION-FORM", write_dataset, tmp_path / "new", scene, RenderOptions(bit_depth=16))
 
 
-def test_a_data_set_that_fails_leaves_no_folder(tmp_path):
+def test_a_data_set_that_fails_leaves_no_folder(tmp_path, scene):
     def fails(done, total):
         raise RuntimeError("no")
 
     folder = tmp_path / "new" / "set"
     with pytest.raises(RuntimeError, match="no"):
-        write_dataset(folder, make_scene(SceneOptions(width=640, height=426, images_per_group=2)), progress=fails)
+        write_dataset(folder, scene, workers=1, progress=fails)
     assert not folder.exists()
 
 
