@@ -440,8 +440,7 @@ def view_of(image: str, board: FlatBoard, ids: np.ndarray, xy_px: np.ndarray, co
 
 SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
 SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-UNKNOWN_BITS = 2
-"""Border of an AprilGrid, in cells, if its file does not state it: Kalibr's."""
+UNKNOWN_BITS = 2  # border of an AprilGrid, in cells, if its file does not state it: Kalibr's
 
 
 def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:

@@ -316,6 +316,12 @@ def _by_class(number: np.ndarray, classes: int, values: Iterable[np.ndarray]) ->
     return np.stack([np.bincount(row, part.ravel(), n * classes).reshape(n, classes) for part in values], axis=-1)
 
 
+def _by_distance(distance: np.ndarray, farthest_px: float, values: Iterable[np.ndarray]) -> np.ndarray:
+    """Return the sums of :func:`_by_class` of pixels in one class of distances from an edge, which all move alike."""
+    most = round(farthest_px / BIN_PX)
+    return _by_class(np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most, 2 * most + 1, values)
+
+
 def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement:
     """Return what turned edges say: whether their profiles move with the phase."""
     pulled = products(harmonic, weight, residual[..., None])[..., 0]
@@ -327,9 +333,7 @@ def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement
 
 def _noise_of(residual, distance, weight) -> np.ndarray:
     """Return the variances (m,) of single pixels, from their scatter within classes of distances from the edge."""
-    most = round(2 * REACH_PX[1] / BIN_PX)
-    place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
-    count, total = np.moveaxis(_by_class(place, 2 * most + 1, (weight, weight * residual)), 2, 0)
+    count, total = np.moveaxis(_by_distance(distance, 2 * REACH_PX[1], (weight, weight * residual)), 2, 0)
     within = (weight * residual**2).sum((1, 2)) - (total**2 / np.maximum(count, 1)).sum(1)
     return np.maximum(within / np.maximum(count.sum(1) - (count > 0).sum(1), 1), ROUNDING)
 
@@ -461,19 +465,12 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
     covariance = growth * noise[:, None, None] * inverse[:, :2, :2]
     for e, displaced in enumerate((first, second)):
         passed = passed_by_blur(np.abs(normal[:, e]).max(1), value[:, 4])
-        covariance += (PRIOR_PX * passed[:, None, None]) ** 2 * _common(pull * displaced[..., None], distance[e], half)
+        summed = _by_distance(distance[e], 2 * half, np.moveaxis(pull * displaced[..., None], 2, 0))
+        covariance += (PRIOR_PX * passed[:, None, None]) ** 2 * np.swapaxes(summed, 1, 2) @ summed
     seen = inside & (redundancy > q) & np.isfinite(covariance).all((1, 2))
     seen &= np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX
     seen &= (np.sqrt(noise) <= MOST_LEFT * np.abs(value[:, 8])) & (np.sqrt(value[:, 4]) <= WIDEST_BLUR * half)
     return start + value[:, :2], covariance, seen
-
-
-def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
-    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2); P : the summed pulls (n, k, 2) of a class."""
-    most = round(2 * half / BIN_PX)
-    place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
-    summed = _by_class(place, 2 * most + 1, np.moveaxis(pull, 2, 0))
-    return np.swapaxes(summed, 1, 2) @ summed
 
 
 def _growth(

@@ -9,7 +9,6 @@ measured in the original image. A ChArUco board is read by its tags (through ``c
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from stcal.boards.board_designs import (
     BoardView,
     CharucoDesign,
     ChessboardDesign,
-    FlatBoard,
+    SquaresOrTags,
     TagLayout,
     column_row,
     view_of,
@@ -180,8 +179,7 @@ def why_no_chessboard(image: np.ndarray, board: ChessboardDesign) -> str:
     return f"{inner}, but {rows}×{columns}: {part}, or {correct} in its file"
 
 
-LEAST_CORNERS = 4
-"""Smallest number of corners of a view: they determine a homography."""
+LEAST_CORNERS = 4  # smallest number of corners of a view: they determine a homography
 NEIGHBOURS = 12
 """Number of nearest corners that predict a corner: neither a lens nor a bent board bends such a small patch by much."""
 TESTED_FROM = 8
@@ -390,34 +388,30 @@ LEAST_COSINE = float(np.cos(np.radians(MOST_TILT_DEG)))
 
 
 def find_on_faces(
-    image: np.ndarray, name: str, boards: Mapping[str, FlatBoard], camera: Camera
+    image: np.ndarray, name: str, boards: Mapping[str, SquaresOrTags], camera: Camera
 ) -> tuple[dict[str, BoardView], list[str]]:
     """Return the views of boards and tags in a grey image by face, and notes on what was left out."""
     together = [tags_on(board) for board in boards.values() if isinstance(board, TagLayout | CharucoDesign)]
     tags = find_tags(image, [dictionary for own in together for dictionary, _ in own], windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
 
-    def charuco(board: CharucoDesign) -> tuple[BoardView | None, str]:
-        if read.isdisjoint(tags_on(board)):
-            return None, f"no tag of {board.dictionary}"
-        return find_charuco(image, name, board), ""
+    def found(board: SquaresOrTags) -> tuple[BoardView | None, str]:
+        if isinstance(board, TagLayout):
+            return view_of_tags(name, tags, board), ""
+        if isinstance(board, AprilGridDesign):
+            return find_aprilgrid(image, name, board, camera)
+        if isinstance(board, ChessboardDesign):
+            view = find_chessboard(image, name, board, with_sigma=True)
+            return view, "" if view else why_no_chessboard(image, board)
+        unread = read.isdisjoint(tags_on(board))
+        return (None, f"no tag of {board.dictionary}") if unread else (find_charuco(image, name, board), "")
 
-    def chessboard(board: ChessboardDesign) -> tuple[BoardView | None, str]:
-        view = find_chessboard(image, name, board, with_sigma=True)
-        return view, "" if view else why_no_chessboard(image, board)
-
-    finders: dict[type, Callable[[Any], tuple[BoardView | None, str]]] = {
-        TagLayout: lambda board: (view_of_tags(name, tags, board), ""),
-        CharucoDesign: charuco,
-        ChessboardDesign: chessboard,
-        AprilGridDesign: lambda board: find_aprilgrid(image, name, board, camera),
-    }
     views: dict[str, BoardView] = {}
     notes: list[str] = []
     for face, board in boards.items():
         view, why, oblique = None, "", ""
         try:
-            view, why = finders[type(board)](board)
+            view, why = found(board)
             if view is not None and isinstance(board, TagLayout | AprilGridDesign):
                 view, oblique = _not_oblique(view)
                 view = straightened(view, camera)

@@ -22,8 +22,7 @@ Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
 """Number in a row of a chessboard. Smaller grids are not recognised, or have all inner corners on one line."""
-FAMILY = "tag36h11"
-"""The family where the file names none: settings.yaml of apriltag_ros does."""
+FAMILY = "tag36h11"  # the family where the file names none: settings.yaml of apriltag_ros does
 METRE_MM = 1000.0
 FLAT_MM, FLAT_RAD = 0.01, 1e-3
 """Largest deviation of tags from one plane: what a file rounds off."""

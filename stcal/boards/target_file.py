@@ -191,23 +191,39 @@ def _of_circles(face: _CirclesFile, where: str) -> FaceDesign:
     ids, radii = tuple(circle.id for circle in face.circles), [circle.radius_mm for circle in face.circles]
     with named(where, f"face {face.id}"):
         drawn = FaceDesign(face.id, ids, xy, radii, face.origin, face.x, face.y)
-    origin, x = xy[ids.index(face.origin)], xy[ids.index(face.x)]
-    along = (x - origin) / np.linalg.norm(x - origin)
-    face_from_drawing = np.array([along, [-along[1], along[0]]])
-    placed: dict[str, Any] = {"xy_mm": (xy - origin) @ face_from_drawing.T}
+    own, drawing_from_face = in_own_frame(drawn)
+    placed: dict[str, Any] = {}
     if face.rough_pose is not None:
-        drawing_from_face = np.eye(3)
-        drawing_from_face[:2, :2] = face_from_drawing.T
-        rough = _rough_pose(face.rough_pose, where) @ Rigid(drawing_from_face, np.append(origin, 0.0))
-        placed["rough_target_from_face"] = rough
+        placed["rough_target_from_face"] = _rough_pose(face.rough_pose, where) @ drawing_from_face
     if face.outline_mm is not None:
         outline = np.array(face.outline_mm)
         _require_inside(drawn, outline, where)
-        placed["outline_mm"] = (outline - origin) @ face_from_drawing.T
+        placed["outline_mm"] = _flat_from(drawing_from_face, outline)
     rims = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
     if rims != [None] * len(rims):
         placed["rim_mm"] = np.array([rim or 0.0 for rim in rims])
-    return replace(drawn, **placed)
+    return replace(own, **placed)
+
+
+def three_point_frame(origin: np.ndarray, on_x: np.ndarray, on_y: np.ndarray) -> Rigid:
+    """Returns a_from_face of the frame through three points of frame a: X through ``on_x``, ``on_y`` on Y's side."""
+    x = (on_x - origin) / np.linalg.norm(on_x - origin)
+    z = np.cross(x, on_y - origin)
+    z /= np.linalg.norm(z)
+    return Rigid(np.column_stack([x, np.cross(z, x), z]), origin)
+
+
+def in_own_frame(drawn: FaceDesign) -> tuple[FaceDesign, Rigid]:
+    """Returns a face that is given in any drawing frame in its own: origin at circle ``origin``, X through circle
+    ``x``, Y on the side of circle ``y``; and drawing_from_face."""
+    frame = (drawn.xy_mm[drawn.ids.index(circle)] for circle in (drawn.origin, drawn.x, drawn.y))
+    drawing_from_face = three_point_frame(*(np.append(xy, 0.0) for xy in frame))
+    return replace(drawn, xy_mm=_flat_from(drawing_from_face, drawn.xy_mm)), drawing_from_face
+
+
+def _flat_from(drawing_from_face: Rigid, xy_mm: np.ndarray) -> np.ndarray:
+    """Returns places (n, 2) of a drawing in the frame of its face."""
+    return (xy_mm - drawing_from_face.translation[:2]) @ drawing_from_face.rotation[:2, :2]
 
 
 def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
@@ -465,8 +481,10 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
     if (colour := getattr(first, "polarity", "")) and colour == getattr(second, "polarity", ""):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
     for whole, part in ((first, second), (second, first)):
-        if not isinstance(part, ChessboardDesign) or not (inner := _inner(whole)):
+        if not isinstance(part, ChessboardDesign) or not isinstance(whole, ChessboardDesign | CharucoDesign):
             continue
+        outer = int(isinstance(whole, CharucoDesign))  # whose rows and columns are those of squares
+        inner = whole.rows - outer, whole.columns - outer
         if all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True)):
             return (
                 f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
@@ -475,9 +493,3 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
     if common := sorted(set(tags_on(first)) & set(tags_on(second))):
         return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
     return ""
-
-
-def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
-    if isinstance(board, ChessboardDesign):
-        return board.rows, board.columns
-    return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None

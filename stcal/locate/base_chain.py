@@ -143,8 +143,7 @@ STILL, STILL_RAD = 0.02, np.radians(2)
 """Largest RMS variation between scenes of a target that stands still: share of its distance from the camera, angle."""
 FAR_BETTER, BETTER = 30.0, 5.0
 """Factors by which the product of both variations, and that in position, must shrink in another convention."""
-UNITS = ("m", "in")
-"""Units in which lengths may be given by mistake instead of mm."""
+UNITS = ("m", "in")  # units in which lengths may be given by mistake instead of mm
 
 
 def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str, ...]:

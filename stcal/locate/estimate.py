@@ -33,8 +33,7 @@ from stcal.locate.layout import TargetLayout
 
 SETTLED = 1e-5
 """Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
-WEIGHED = 1e-6
-"""Least decrease of χ²: a step of less than σ/1000 is the last."""
+WEIGHED = 1e-6  # least decrease of χ²: a step of less than σ/1000 is the last
 
 
 @dataclass(frozen=True, slots=True, eq=False)

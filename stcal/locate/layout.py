@@ -17,8 +17,7 @@ from stcal.io.toml import toml_string
 from stcal.lengths import side, stated_unusual
 
 WHAT = "layout file"
-WRITTEN_MM = 1e-6
-"""Largest difference of a written corner, mm: its last decimal."""
+WRITTEN_MM = 1e-6  # largest difference of a written corner, mm: its last decimal
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

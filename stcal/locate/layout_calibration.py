@@ -34,8 +34,7 @@ STEP_MM = 1e-4
 """Step of numerical derivatives of the frame {obj}, which turns by 1e-5 rad at most."""
 TOGETHER = np.tile(np.eye(2), (4, 1))
 """Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
-APART = null_space(TOGETHER.T)
-"""Basis (8, 6) of all other displacements of a tag's corners."""
+APART = null_space(TOGETHER.T)  # basis (8, 6) of all other displacements of a tag's corners
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -383,7 +382,10 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
     """Returns the calibration in {obj}. The frame is defined by the corners of one tag, and depends on their errors."""
     origin = int(np.flatnonzero(tag_rows == plan.origin)[0])
     turn, shift = obj_from_plane(adjusted.corners_mm[origin])
-    by_corner = _by_board_corners(adjusted.corners_mm, origin)
+    # Derivative (8n, 8n) of corners in {obj} by those on the board, from central differences.
+    flat, steps = adjusted.corners_mm.ravel(), STEP_MM * np.eye(adjusted.corners_mm.size)
+    ends = ([in_obj((flat + sign * step).reshape(-1, 4, 2), origin).ravel() for step in steps] for sign in (1, -1))
+    by_corner = np.subtract(*map(np.array, ends)).T / (2 * STEP_MM)
     covariance = by_corner @ adjusted.covariance_mm2 @ by_corner.T
     layout = TargetLayout(
         plan.name,
@@ -413,13 +415,6 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         deviation,
         tuple(left_out),
     )
-
-
-def _by_board_corners(corners: np.ndarray, origin: int) -> np.ndarray:
-    """Returns the derivative (8n, 8n) of corners in {obj} by those on the board, from central differences."""
-    flat, steps = corners.ravel(), STEP_MM * np.eye(corners.size)
-    ends = ([in_obj((flat + sign * step).reshape(-1, 4, 2), origin).ravel() for step in steps] for sign in (1, -1))
-    return np.subtract(*map(np.array, ends)).T / (2 * STEP_MM)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,8 +43,7 @@ from stcal.geometry.robust import ratio_limit
 Transform = Rigid | Similarity | Affine
 EXACT = 1e-11
 """Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
-SHOWN = 5
-"""Number of rows that a message names."""
+SHOWN = 5  # number of rows that a message names
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,8 +295,7 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
     return moved if isinstance(transform, Rigid) else Similarity(scale, moved)
 
 
-WIDE = 8.0
-"""Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
+WIDE = 8.0  # threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
@@ -438,16 +436,14 @@ def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensu
     return best
 
 
-SUBSET = 500
-"""Number of points on which samples are scored. It gives σ and shares to 2 %."""
+SUBSET = 500  # number of points on which samples are scored. It gives σ and shares to 2 %.
 CLEAN_SETS_WITH_OUTLIER = 0.001
 """Probability that a clean set has any point that is called an outlier."""
 LEVERAGE_UP_TO = 10_000
 """Largest number of points for which leverage is considered: beyond, it adds under 0.02 % to a residual."""
 MAX_ROUNDS = 50
 """Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
-BY_CHANCE = 0.01
-"""Largest number of false alarms of a consensus that is accepted, per file."""
+BY_CHANCE = 0.01  # largest number of false alarms of a consensus that is accepted, per file
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,8 +24,7 @@ NEIGHBOURS = 2000
 """Largest number of points whose residuals are compared with the nearest neighbour's."""
 FEWEST_NEIGHBOURS = 20
 """Least number of points for this comparison, as the sum of fewer products is not normal."""
-BY_NEIGHBOURS = 1e-4
-"""Probability of calling clean data bent."""
+BY_NEIGHBOURS = 1e-4  # probability of calling clean data bent
 
 
 def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
@@ -80,10 +79,8 @@ def order_note(change: Change, problem: Problem) -> str:
     )
 
 
-TRIED = 200
-"""Largest number of points that are examined for groups."""
-TOGETHER = 0.01
-"""Probability that scattered groups seem to lie together."""
+TRIED = 200  # largest number of points that are examined for groups
+TOGETHER = 0.01  # probability that scattered groups seem to lie together
 
 
 def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:

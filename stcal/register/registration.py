@@ -104,8 +104,7 @@ def orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Opt
 
 
 METHODS = ("robust", "least-squares", "liu2017")
-DISTINCT = 5.0
-"""Least distance between two distinct transforms, in σ."""
+DISTINCT = 5.0  # least distance between two distinct transforms, in σ
 MOST_OF_REST = 0.5
 """Least share of the outliers that must agree on another transform: a few of many always lie near one by chance."""
 AS_GOOD = 0.5
@@ -399,16 +398,12 @@ def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
     if np.linalg.cond(two) > n / 2:
         return 0.0
     bound = wilks_bound(np.linalg.slogdet(two)[1] - np.linalg.slogdet(one)[1], of_error, per_axis)
-    if n <= FEW and sphericity(two, of_error) > SPHERICAL:
+    # of equal noise along all axes (Mauchly 1940, with Bartlett's factor)
+    statistic = -(of_error - 23 / 18) * (np.linalg.slogdet(two)[1] - 3 * np.log(np.trace(two) / 3))
+    if n <= FEW and chdtrc(5, max(statistic, 0.0)) > SPHERICAL:
         share = np.trace(two) / np.trace(one)
         bound = min(bound, float(consensus.chernoff(share, 1.5 * of_error, model.parameters / 2)))
     return bound
-
-
-def sphericity(scatter: np.ndarray, redundancy: float) -> float:
-    """Returns the p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
-    w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
-    return float(chdtrc(5, max(-(redundancy - 23 / 18) * w, 0.0)))
 
 
 def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:

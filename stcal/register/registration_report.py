@@ -11,7 +11,7 @@ from pydantic import Field as Key
 
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.io.json import Finite, Matrix, Matrix4, Named, Points, ResultFile, Vector3
+from stcal.io.json import Finite, Matrix, Matrix4, Named, Points, ResultFile, Rows, Vector3
 from stcal.parallel import one_thread
 from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
 from stcal.register.registration import Liu2017Options, orthogonal_samples
@@ -22,8 +22,7 @@ from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
 """Largest number of rows that are all listed. Of more, only the outliers and some inliers are."""
-WORST = 5
-"""Number of inliers that are then listed, those with the largest residuals."""
+WORST = 5  # number of inliers that are then listed, those with the largest residuals
 
 
 def registration_report(found: Findings, more: Sequence[Section] = ()) -> Document:
@@ -201,8 +200,7 @@ def _where_it_holds(found: Findings) -> list[Block]:
     return blocks or [page_only("Too few points to tell")]
 
 
-VIEWS = ((0, 1), (0, 2), (1, 2))
-"""Horizontal and vertical axis of each view."""
+VIEWS = ((0, 1), (0, 2), (1, 2))  # horizontal and vertical axis of each view
 MOST_ARROWS = 1500
 ARROW_SHARE, FEW = 0.12, 80
 """Length of the inliers' RMS residual as a share of the picture's side; number of points above which it shrinks."""
@@ -257,8 +255,6 @@ def sample_size_section(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
     return Section("Size of the sample", [told, Table(heads, rows)])
 
 
-Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
-"""Rows of the file of points, from 0."""
 FIGURES = "`points`, `mean_mm`, `rms_mm`, `max_mm`"
 Marks = Annotated[list[bool], BeforeValidator(lambda marks: np.asarray(marks, bool).tolist())]
 Rounded = Annotated[Points, BeforeValidator(lambda values: np.round(values, 9))]

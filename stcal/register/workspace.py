@@ -1,6 +1,7 @@
 """Range of validity of a registration: systematic residuals over the workspace, and errors around cubes."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -257,19 +258,17 @@ def cubes(
     step = 10.0 ** (np.floor(np.log10(reach.max())) - 1)
     outer = np.ceil(reach.max() / step * (1 - 1e-9)) * step
     sides = [share * outer for share in SHARES if (reach <= share * outer).sum() >= LEAST_POINTS]
-    table = []
+    by_side: dict[float, np.ndarray] = {}
     for side in sides:
-        try:
-            table.append((side, _errors(problem, reach <= side, folds, registration.seed)))
-        except StcalError:  # the points of the inner cube may lie in a plane
-            continue
-    if not table:
+        with suppress(StcalError):  # the points of the inner cube may lie in a plane
+            by_side[side] = _errors(problem, reach <= side, folds, registration.seed)
+    if not by_side:
         return None
-    sides = [side for side, _ in table]
+    sides = list(by_side)
     shell = np.searchsorted(sides, reach * (1 - 1e-12))
     errors = tuple(
         tuple(ErrorFigures.of(error[shell == j]) if (shell == j).any() else None for j in range(len(sides)))
-        for _, error in table
+        for error in by_side.values()
     )
     return Cubes(middle, np.array(sides), errors)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.boards.board_designs import TAG_SIGMA_MM, UNIT_SQUARE, TagLayout
 from stcal.boards.dictionaries import dictionary_of, known_tags
-from stcal.boards.target_file import printed_face, tags_on
+from stcal.boards.target_file import in_own_frame, printed_face, tags_on
 from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
@@ -45,22 +45,9 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
 
 
 def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple[FaceDesign, Rigid]:
-    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face. The face frame has
-    its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``."""
-    ids = tuple(row[0] for row in circles)
-    xy = np.array([row[1:3] for row in circles], float)
-    zero, on_x, on_y = (np.append(xy[ids.index(circle)], 0.0) for circle in (origin, x, y))
-    drawing_from_face = three_point_frame(zero, on_x, on_y)
-    xy_face = (drawing_from_face.inverse() @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
-    return FaceDesign(face_id, ids, xy_face, [row[3] for row in circles], origin, x, y), drawing_from_face
-
-
-def three_point_frame(origin: np.ndarray, on_x: np.ndarray, on_y: np.ndarray) -> Rigid:
-    """Returns a_from_face of the frame through three points of frame a: X through ``on_x``, ``on_y`` on Y's side."""
-    x = (on_x - origin) / np.linalg.norm(on_x - origin)
-    z = np.cross(x, on_y - origin)
-    z /= np.linalg.norm(z)
-    return Rigid(np.column_stack([x, np.cross(z, x), z]), origin)
+    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face."""
+    ids, xy = tuple(row[0] for row in circles), np.array([row[1:3] for row in circles], float)
+    return in_own_frame(FaceDesign(face_id, ids, xy, [row[3] for row in circles], origin, x, y))
 
 
 FAMILY = "DICT_APRILTAG_36h11"

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stcal.boards.target_file import three_point_frame
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments, require_fields
@@ -16,7 +17,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel, Label
-from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point_frame
+from stcal.synthetic.designs import REFERENCE_GROUPS, second_design
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
 __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]

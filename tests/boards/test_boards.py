@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.board_designs import CharucoDesign, ChessboardDesign, TagLayout
-from stcal.boards.board_file import load_flat_board
+from stcal.boards.board_designs import UNIT_SQUARE, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.finders import find_charuco, find_chessboard
 from stcal.boards.tags import find_tags, view_of_tags
 from stcal.geometry.plane import apply_homography
@@ -104,7 +103,7 @@ def test_tags_of_two_families_and_sizes():
         drawn = cv2.aruco.generateImageMarker(dictionary, tag, size * 4)
         left, top = 4 * x - 2 * size, 4 * y - 2 * size
         sheet[top : top + 4 * size, left : left + 4 * size] = drawn
-        corners.append(size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) + [x, y])
+        corners.append(size * UNIT_SQUARE + [x, y])
     layout = TagLayout(tuple(places), np.array(corners))
     tags = find_tags(photograph(sheet, 4, IMAGE_FROM_MM), families)
     assert set(tags.tags) == set(places)
@@ -140,15 +139,3 @@ def test_all_corners_of_a_real_charuco_board(shared_data):
     images = sorted(shared_data("charuco_handeye/test_set_charuco/images").glob("*.png"))[::4]
     views = [find_charuco(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), path.name, board) for path in images]
     assert list(map(len, views)) == [24] * 4
-
-
-def test_a_tag_stands_where_the_file_puts_it(tmp_path):
-    path = tmp_path / "board.toml"
-    path.write_text(
-        'type = "tags"\n[[tag]]\ndictionary = "DICT_4X4_50"\nid = 1\nsize_mm = 20.0\nx_mm = 100.0\ny_mm = 50.0\n'
-        "angle_deg = 90.0\n",
-        encoding="utf-8",
-    )
-    corners = load_flat_board(path).corners_mm[0]
-    # turned from X to Y: top left goes to where top right was
-    assert np.allclose(corners, [[110, 40], [110, 60], [90, 60], [90, 40]])

@@ -81,11 +81,8 @@ def test_sigma_of_a_crossing_grows_with_edges_that_are_not_straight(ragged_px, l
         move = ragged_px * np.repeat(rng.normal(size=(2, side)), fine, axis=1)
         right = ((at[None] - x - move[0][:, None]) * fine + 0.5).clip(0, 1)  # shares of the fine pixels
         below = ((at[:, None] - y - move[1][None]) * fine + 0.5).clip(0, 1)
-        blurred = (
-            gaussian_filter(right * below + (1 - right) * (1 - below), 0.7 * fine)
-            .reshape(side, fine, side, fine)
-            .mean((1, 3))
-        )
+        black = gaussian_filter(right * below + (1 - right) * (1 - below), 0.7 * fine)
+        blurred = black.reshape(side, fine, side, fine).mean((1, 3))
         windows.append(np.rint(60 + 120 * blurred + rng.normal(0, 1.5, (side, side))).astype(np.uint8))
     picture = np.concatenate(windows, axis=1)
     place = true + np.column_stack([side * np.arange(200), np.zeros(200)])

@@ -9,23 +9,26 @@ from stcal.boards.board_designs import (
     BoardSet,
     CharucoDesign,
     ChessboardDesign,
+    HexagonalCirclesDesign,
 )
-from stcal.boards.board_file import load_flat_board
+from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.boards.target_file import load_boards
+from stcal.design import DOTS_SIGMA_MM, BoardDesign, reference_board
 from stcal.errors import InputError
 
 APRILGRID = 'type = "aprilgrid"\nrows = 6\ncolumns = 7\ntag_mm = 80.0\nspacing = 0.3\n'
 ASYMMETRIC = (
     'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
 )
+HEXAGONAL = ASYMMETRIC.replace("asymmetric", "hexagonal").replace("rows = 11", "rows = 9")
+DOTS = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
+WITH_CORNER = [BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, place, 4.5) for place in ((0, 3), (2, 0))]
 KALIBR = {
     "aprilgrid": "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.08\ntagSpacing: 0.3\n",
-    "checkerboard": (
-        "target_type: 'checkerboard'\ntargetCols: 7\ntargetRows: 6\nrowSpacingMeters: 0.05\ncolSpacingMeters: 0.05\n"
-    ),
-    "circlegrid": (
-        "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n"
-    ),
+    "checkerboard": "target_type: 'checkerboard'\ntargetCols: 7\ntargetRows: 6\n"
+    "rowSpacingMeters: 0.05\ncolSpacingMeters: 0.05\n",
+    "circlegrid": "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\n"
+    "spacingMeters: 0.02\nasymmetricGrid: True\n",
 }
 CHARUCO = 'type = "charuco"\nrows = 6\ncolumns = 8\nsquare_mm = 20.0\nmarker_mm = 10.0\ndictionary = "5X5_50"\n'
 TAG = 'type = "tags"\n[[tag]]\ndictionary = "4X4_50"\nid = 1\nsize_mm = 9\nx_mm = 0\ny_mm = 0\n'
@@ -51,13 +54,23 @@ def written(folder, text, name="board.toml"):
             ASYMMETRIC.replace("radius_mm = 6.0", "diameter_mm = 12.0"),
             AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark"),
         ),
+        (HEXAGONAL, HexagonalCirclesDesign(9, 4, 20.0, 6.0, "dark")),
+        (
+            HEXAGONAL + "rings = [[1, 2], [0, 3]]\n",
+            HexagonalCirclesDesign(9, 4, 20.0, 6.0, "dark", rings=((0, 3), (1, 2))),
+        ),
+        (DOTS + "rings = [[0, 3]]\n", BoardDesign(5, 7, 20.0, 5.0, "dark", DOTS_SIGMA_MM, rings=((0, 3),))),
+        *((board_toml(board), board) for board in (reference_board(), *WITH_CORNER)),
         (KALIBR["aprilgrid"], AprilGridDesign(5, 6, 80.0, 0.3)),
         (KALIBR["checkerboard"], ChessboardDesign(6, 7, 50.0)),
         (KALIBR["circlegrid"], AsymmetricCirclesDesign(11, 4, 20.0, None, "dark")),
     ],
 )
-def test_files_of_every_kind(tmp_path, text, board):
-    assert load_flat_board(written(tmp_path, text)) == load_boards(written(tmp_path, text)) == board
+def test_files_of_every_kind_and_back(tmp_path, text, board):
+    path = written(tmp_path, text)
+    assert load_flat_board(path) == load_boards(path) == board
+    if getattr(board, "radius_mm", 0.0) is not None:
+        assert load_flat_board(written(tmp_path, board_toml(load_board(path)))) == board
 
 
 def test_opencvs_asymmetric_grid():
@@ -79,6 +92,12 @@ def test_opencvs_asymmetric_grid():
         (APRILGRID + "border_bits = 3\n", "border_bits"),
         (ASYMMETRIC.replace("radius_mm = 6.0", ""), "radius_mm or diameter_mm needed, one of them"),
         (ASYMMETRIC.replace("6.0", "15.0"), "radius 15 mm, under 14.1421 mm needed for circles apart"),
+        (
+            HEXAGONAL.replace("6.0", "10.5"),
+            "radius 10.5 mm, under 10 mm needed for circles apart; spacing_mm is what",
+        ),
+        (DOTS + "rings = [[5, 0]]\n", "rings has [5, 0] of 5 rows of 7 dots"),
+        (DOTS + "rings = [[0, 0], [4, 6]]\n", "2 rings that look the same after a turn"),
         (KALIBR["aprilgrid"].replace("0.08", "800"), "tagSize"),
         (KALIBR["aprilgrid"].replace("tagRows: 5", "tagRows: 500"), "tags up to 2999, tag36h11 has 0 … 586"),
         (KALIBR["checkerboard"].replace("colSpacingMeters: 0.05", "colSpacingMeters: 0.04"), "squares needed"),
@@ -128,10 +147,7 @@ def test_several_boards_in_one_frame(tmp_path):
         (CHARUCO + "first_id = 30\n", "tags 30 … 53, DICT_5X5_50 has 0 … 49"),
         ('type = "chessboard"\nrows = 4\ncolumns = 6\nsquare_mm = 20.0\n', "board 2 looks the same when turned"),
         ('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 20.0\n', "4×5 inner corners are seen in 5×7 too"),
-        (
-            'rows = 5\ncolumns = 7\npitch_mm = 9.0\nradius_mm = 2.0\npolarity = "dark"\n',
-            "board 2 looks the same when turned",
-        ),
+        (DOTS, "board 2 looks the same when turned"),
         ('file = "none.toml"\n', "board 2: board file"),
         ('file = "b.toml"\nrows = 5\n', "rows beside file"),
         ("file = 5\n", "file: a string needed"),

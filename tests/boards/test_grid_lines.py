@@ -39,17 +39,10 @@ def told(displaced_px: float, seed: int, by_phase: bool = False) -> float:
     grey = np.rint(image + np.sqrt(NOISE) * rng.standard_normal(image.shape)).astype(np.uint8)
     low, high = lines[0], lines[-1]
     corners = np.array([[[low, low], [high, low], [high, high], [low, high]]])
-    one = np.ones(1)
-    outer = OuterLines(
-        corners,
-        BLUR_PX**2 * one,
-        DARK * one,
-        RISE * one,
-        (NOISE + 1 / 12) * one,
-        np.full((1, 4), 1e-6),
-        # Outwards from the upper, right, lower and left edge.
-        np.stack([np.cos(2 * np.pi * OUTWARDS), np.sin(2 * np.pi * OUTWARDS)], axis=-1)[None],
-    )
+    blur, dark, rise, noise = np.array([[BLUR_PX**2], [DARK], [RISE], [NOISE + 1 / 12]])
+    # Outwards from the upper, right, lower and left edge.
+    by_sampling = np.stack([np.cos(2 * np.pi * OUTWARDS), np.sin(2 * np.pi * OUTWARDS)], axis=-1)[None]
+    outer = OuterLines(corners, blur, dark, rise, noise, np.full((1, 4), 1e-6), by_sampling)
     waves, otherwise = told_by_lines(grey, outer, CELLS)
     return float(displacement_variance([waves], [otherwise]).of(np.ones(1))[0])
 
@@ -61,7 +54,6 @@ def test_lines_that_tell_nothing_leave_the_prior():
     found = displacement_variance([Displacement(0 * one, 1e-8 * one, 4 * one, 0 * one)])
     assert found.of_area == pytest.approx(PRIOR_PX**2)
     assert found.of(np.zeros(1)) == pytest.approx(0.0, abs=1e-6)
-    one = np.ones(2)
     found = displacement_variance([Displacement(0 * one, one, one, one)])
     assert np.sqrt(found.of(np.ones(1))) == pytest.approx(np.hypot(PRIOR_PX, POINTS_PX), rel=0.01)
 

@@ -6,16 +6,13 @@ import pytest
 from scipy.spatial import cKDTree
 
 from stcal.boards.board_designs import HexagonalCirclesDesign
-from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.workflows.board_views import find_board
 from tests.levels import sampled
-from tests.outcome import refuses
 
 CAMERA = Camera(800, 600, [900.0, 905.0], [390.0, 305.0], np.zeros(12))
 FINER, MARGIN_MM = 2, 25.0
-TEXT = 'type = "hexagonal-circles"\nrows = 9\ncolumns = 8\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
 TILTS = [(0.0, 0.0, 0.1), (0.5, 0.0, 0.3), (0.0, 0.6, -1.2), (0.3, -0.4, 2.5)]
 
 
@@ -29,7 +26,8 @@ def view_of(
     middle = np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
     pose = Rigid(turn, np.array([0, 0, 470.0]) - turn @ middle)
     y, x = (np.mgrid[: CAMERA.height * FINER, : CAMERA.width * FINER] + 0.5) / FINER - 0.5
-    rays = np.column_stack([CAMERA.normalised_from_pixel(np.column_stack([x.ravel(), y.ravel()])), np.ones(x.size)])
+    xy_px = np.column_stack([x.ravel(), y.ravel()])
+    rays = np.pad((xy_px - CAMERA.centre) / CAMERA.focal, ((0, 0), (0, 1)), constant_values=1.0)
     normal = turn[:, 2]
     met = ((rays * (normal @ pose.translation / (rays @ normal))[:, None]) - pose.translation) @ turn
     on_board = ((met[:, :2] > xy.min(0) - MARGIN_MM) & (met[:, :2] < xy.max(0) + MARGIN_MM)).all(1)
@@ -41,36 +39,6 @@ def view_of(
     small = cv2.resize(grey.reshape(x.shape), (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
     noise = np.random.default_rng(0).normal(0, 1.5, small.shape)
     return np.clip(cv2.GaussianBlur(small, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8), pose
-
-
-DOTS = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
-
-
-@pytest.mark.parametrize(
-    ("text", "rings"),
-    [(TEXT, ()), (f"{TEXT}rings = [[1, 2], [0, 3]]\n", ((0, 3), (1, 2))), (f"{DOTS}rings = [[0, 3]]\n", ((0, 3),))],
-)
-def test_a_file_and_back(tmp_path, text, rings):
-    (tmp_path / "b.toml").write_text(text)
-    board = load_flat_board(tmp_path / "b.toml")
-    assert board.rings == rings
-    if text == TEXT:
-        assert board == HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
-    (tmp_path / "again.toml").write_text(board_toml(load_board(tmp_path / "b.toml")))
-    assert load_flat_board(tmp_path / "again.toml") == board
-
-
-@pytest.mark.parametrize(
-    ("text", "error"),
-    [
-        (TEXT.replace("6.0", "10.5"), "E-BOARD-RADIUS … 10.5 mm, under 10 mm … neighbours"),
-        (f"{DOTS}rings = [[5, 0]]\n", "E-BOARD-RINGS … [5, 0]"),
-        (f"{DOTS}rings = [[0, 0], [4, 6]]\n", "E-BOARD-RINGS … 2 rings that look the same after a turn"),
-    ],
-)
-def test_mistakes_in_files(tmp_path, text, error):
-    (tmp_path / "b.toml").write_text(text)
-    refuses(error, load_flat_board, tmp_path / "b.toml")
 
 
 def test_six_neighbours_are_one_spacing_away():

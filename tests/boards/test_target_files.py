@@ -82,20 +82,6 @@ def test_the_reference_has_the_published_layout():
     refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", target.face, "9")
 
 
-@pytest.mark.parametrize(
-    "board",
-    [
-        reference_board(),
-        BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, (0, 3), 4.5),
-        BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, (2, 0), 4.5),
-    ],
-)
-def test_board_round_trip(tmp_path, board):
-    found = board_of(tmp_path, board_toml(board))
-    for name in ("rows", "columns", "pitch_mm", "radius_mm", "polarity", "sigma_mm", "corner", "corner_radius_mm"):
-        assert getattr(found, name) == getattr(board, name)
-
-
 def test_the_commented_corner_is_right_once_uncommented(tmp_path):
     text = re.sub(r"^# (\[corner\]|row|column|radius_mm)", r"\1", board_toml(reference_board()), flags=re.MULTILINE)
     found = board_of(tmp_path, text)

@@ -153,8 +153,7 @@ def points_px(sheet, part, board, page) -> np.ndarray:
     return pixel_from_page(page, board.xy_mm() * [1, -1] + shift)
 
 
-TAGS = TagLayout((("DICT_5X5_50", 3), ("DICT_5X5_50", 7)), [[[0, 0], [20, 0], [20, 20], [0, 20]],
-                 [[40, 5], [60, 0], [65, 20], [45, 25]]])  # fmt: skip
+TAGS = TagLayout.from_tags("5X5_50", [3, 7], [[10, 10], [52.5, 12.5]], [20, 20.6], [0, -14])
 BOARDS = {
     "chessboard": ChessboardDesign(5, 8, 12.0),
     "charuco of even rows": CharucoDesign(6, 5, 12.0, 9.0, "DICT_5X5_50", first_id=4),

@@ -174,30 +174,23 @@ def times(each, factor: float):
 
 
 MISTAKES = {
-    "xyzw": (
-        lambda f, m: (rolled(f), m),
-        "the robot's quaternions were x, y, z, w in the order .*; give --quaternions xyzw",
-    ),
-    "conjugated": (lambda f, m: (INVERTED.poses(f), m), "the robot's quaternions were conjugated"),
-    "inverse": (lambda f, m: (f.inverse(), m), "the robot's poses were flange_from_base"),
-    "hand-eye inverse": (lambda f, m: (f, m.inverse()), "the hand-eye were camera_from_flange"),
-    "metres": (lambda f, m: (times(f, 1e-3), m), "the robot's lengths were metres; name the columns _m"),
-    "inches": (lambda f, m: (times(f, 1 / 25.4), m), "the robot's lengths were inches; name the columns _in"),
-    "hand-eye in metres": (
-        lambda f, m: (f, times(m, 1e-3)),
-        "the hand-eye's lengths were metres; multiply them by 1000",
-    ),
+    "robot's quaternions were x, y, z, w in the order .*; give --quaternions xyzw": lambda f, m: (rolled(f), m),
+    "robot's quaternions were conjugated": lambda f, m: (INVERTED.poses(f), m),
+    "robot's poses were flange_from_base": lambda f, m: (f.inverse(), m),
+    "hand-eye were camera_from_flange": lambda f, m: (f, m.inverse()),
+    "robot's lengths were metres; name the columns _m": lambda f, m: (times(f, 1e-3), m),
+    "robot's lengths were inches; name the columns _in": lambda f, m: (times(f, 1 / 25.4), m),
+    "hand-eye's lengths were metres; multiply them by 1000": lambda f, m: (f, times(m, 1e-3)),
 }
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("mistake", MISTAKES)
 @pytest.mark.parametrize("count", [2, 12])
-def test_a_target_that_stands_still_shows_the_mistake(name, count):
-    wrong, says = MISTAKES[name]
+def test_a_target_that_stands_still_shows_the_mistake(mistake, count):
     for seed in range(2):
         flange, seen = looks(seed, count)
-        flange, mount = wrong(flange, CAMERA_ON_FLANGE)
-        with pytest.raises(InputError, match=rf"varies by .* \(RMS of {count} scenes\), but by .* if {says}"):
+        flange, mount = MISTAKES[mistake](flange, CAMERA_ON_FLANGE)
+        with pytest.raises(InputError, match=rf"varies by .* \(RMS of {count} scenes\), but by .* if the {mistake}"):
             judged(flange, seen, mount)
 
 

@@ -9,7 +9,7 @@ import pytest
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import SeenTags, locate, merge
 from stcal.locate.scenes import exposure_times
@@ -29,7 +29,7 @@ LAYOUT = example_layout()
 
 
 def error_of(pose, truth: Rigid) -> np.ndarray:
-    return Poses.of([pose.camera_from_obj]).difference(Poses.of([truth]))[0]
+    return pose.camera_from_obj.difference(truth)
 
 
 @pytest.mark.full
@@ -105,7 +105,7 @@ def test_both_minima_are_refined_and_covered_by_one_covariance_where_they_are_on
     assert tilts[1] > 0.2
     assert 0 <= pose.delta_chi2 < 60
     assert judge(pose, VerdictOptions(max_sigma_deg=90.0))[1].decision == "ambiguous"
-    away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
+    away = pose.second.difference(pose.camera_from_obj)
     equal, verdict = judge(pose, VerdictOptions(equal_deg=90.0, max_sigma_deg=90.0))
     assert verdict.decision == "accept"
     odds = np.exp(-pose.delta_chi2 / 2)

@@ -9,7 +9,7 @@ import pytest
 from stcal.boards.board_designs import CharucoDesign, TagLayout
 from stcal.boards.finders import find_charuco
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import LocateOptions, SceneTags, detect, find_scenes, locate_image, locate_scene, run
@@ -49,7 +49,7 @@ def in_scene(tags, layout, model=MODEL, image=None):
 
 
 def error_of(result, truth: Rigid = TRUTH) -> np.ndarray:
-    return Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))[0]
+    return result.pose.camera_from_obj.difference(truth)
 
 
 def assert_true(result, truth: Rigid = TRUTH) -> None:

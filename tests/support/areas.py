@@ -7,6 +7,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from stcal.boards.board_designs import SquaresOrTags, black_areas
+from stcal.geometry.plane import apply_homography
+from stcal.synthetic.body_scene import covered_share
 
 FINE = 4  # pixels of the grid, along each axis of a pixel, on which blur is applied
 
@@ -23,37 +25,12 @@ def rendered(
     """The board (mm) through a homography to pixels; Gaussian blur, ``grey`` values of black and white."""
     width, height = size
     fine = FINE if blur_px else 1
-    black = np.zeros((height * fine, width * fine))
-    for lines in black_areas(board):
-        for line in lines:
-            there = np.pad(line, ((0, 0), (0, 1)), constant_values=1.0) @ image_from_mm.T
-            add_area(black, (there[:, :2] / there[:, 2:] + 0.5) * fine - 0.5)
+    areas = [[(apply_homography(image_from_mm, line) + 0.5) * fine for line in lines] for lines in black_areas(board)]
+    black = covered_share(areas, (height * fine, width * fine)).astype(float)
     if blur_px:
         black = gaussian_filter(black, blur_px * fine).reshape(height, fine, width, fine).mean((1, 3))
-    level = grey[1] + (grey[0] - grey[1]) * np.abs(black) + noise * rng.standard_normal((height, width))
+    level = grey[1] + (grey[0] - grey[1]) * black + noise * rng.standard_normal((height, width))
     return np.clip(np.rint(level), 0, 255).astype(np.uint8)
-
-
-def add_area(share: np.ndarray, line: np.ndarray) -> None:
-    """Add to each pixel (centres are integers) its share inside a closed line (k, 2), with the sign of its turn."""
-    last = np.array(share.shape[::-1]) - 1
-    first, end = (np.clip(at, 0, last).astype(int) for at in (np.floor(line.min(0)) - 1, np.ceil(line.max(0)) + 1))
-    x, y = (np.arange(a, b + 2) - 0.5 for a, b in zip(first, end, strict=True))
-    below = np.zeros((len(y), len(x)))  # area inside with smaller x and y
-    for (xa, ya), (xb, yb) in zip(line, np.roll(line, -1, axis=0), strict=True):
-        if yb != ya:
-            to = np.clip(y, min(ya, yb), max(ya, yb))
-            ends = [xa + (xb - xa) * (value - ya) / (yb - ya) for value in (np.full_like(to, min(ya, yb)), to)]
-            below += np.sign(yb - ya) * (to - min(ya, yb))[:, None] * _mean_of_least(*ends, x)
-    share[first[1] : end[1] + 1, first[0] : end[0] + 1] += np.diff(np.diff(below, axis=0), axis=1)
-
-
-def _mean_of_least(start: np.ndarray, end: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Mean of min(u, x) over u from each ``start`` to its ``end``, (k, len(x))."""
-    apart = np.abs(end - start) > 1e-7
-    integral = [np.where(u < x, u**2 / 2, x * u - x**2 / 2) for u in (start[:, None], end[:, None])]
-    mean = (integral[1] - integral[0]) / np.where(apart, end - start, 1.0)[:, None]
-    return np.where(apart[:, None], mean, np.minimum((start + end)[:, None] / 2, x))
 
 
 def warped(

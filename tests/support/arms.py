@@ -60,14 +60,8 @@ def modified() -> Robot:
     coupling[2, 1] = 1.0
     limits = np.radians([170, 100, 130, 190, 120, 350])
     joints = tuple(Joint("revolute", -v, v) for v in limits)
-    return Robot(
-        "modified",
-        "modified",
-        tuple(rows),
-        joints,
-        coupling,
-        tools={"": Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])},
-    )
+    tools = {"": Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])}
+    return Robot("modified", "modified", tuple(rows), joints, coupling, tools=tools)
 
 
 def scara() -> Robot:

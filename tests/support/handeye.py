@@ -80,7 +80,7 @@ def handeye(
 
 def error(found: HandEye, truth: Truth) -> np.ndarray:
     """Of X, (6,), as its covariance states it."""
-    return Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+    return found.mount_from_camera.difference(truth.mount_from_camera)
 
 
 def squared(found: HandEye, truth: Truth) -> float:

@@ -32,22 +32,15 @@ class PoseTrial:
 
 
 def half_calibrated(images: CalibrationImages, plan: LayoutPlan, chosen: Sequence[int]) -> CalibratedLayout:
-    return calibrate(
-        plan,
-        [images.views[i] for i in chosen],
-        [images.tags[i] for i in chosen],
-        [images.names[i] for i in chosen],
-        images.camera,
-    )
+    parts = ([each[i] for i in chosen] for each in (images.views, images.tags, images.names))
+    return calibrate(plan, *parts, images.camera)
 
 
 def true_pose(images: CalibrationImages, i: int, calibrated: CalibratedLayout) -> Rigid:
     """camera_from_obj of image i, by its board, printed as the other images tell."""
     view = images.views[i]
     if view is None:
-        raise DegenerateError(
-            "E-LOCATE-NO-BOARD", f"{images.names[i]}: the board is not seen; a pose to compare with needs it"
-        )
+        raise DegenerateError("E-LOCATE-NO-BOARD", f"{images.names[i]}: no board, which the pose to compare with needs")
     seen = images.camera.normalised_from_pixel(view.xy_px)
     longer = calibrated.adjusted.stretch / 2 * np.array([1, -1])
     xy = view.xyz_board[:, :2]

@@ -91,8 +91,7 @@ def faces_view(scene: Scene, faces: Sequence[str]) -> Rigid:
 
 def pose_error(estimate: Rigid, truth: Rigid) -> np.ndarray:
     """(6,) rad and mm: the left perturbation that leads from the truth to the estimate."""
-    turn = Rigid(estimate.rotation @ truth.rotation.T).log()[:3]
-    return np.concatenate([turn, estimate.translation - truth.translation])
+    return estimate.difference(truth)
 
 
 def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:

@@ -200,21 +200,11 @@ def read_set(folder: str | Path, at_most: int | None = None) -> RenderedSet:
             pose = Rigid.from_matrix(image["camera_from_target"])
             planes = _faces(target, truth, pose)
             seen = {label.partition(":")[0] for label in image["circles"]}
-            photographs.append(
-                Photograph(
-                    name,
-                    group,
-                    number,
-                    grey,
-                    camera,
-                    ideal,
-                    pose,
-                    tuple(plane for plane in planes if plane.name in seen),
-                    tuple(plane for plane in planes if plane.name not in seen),
-                    _board(board, np.array(content["board_circles_target"]), pose),
-                    {label: bool(circle["must_find"]) for label, circle in image["circles"].items()},
-                )
-            )
+            faces, hidden = (tuple(each for each in planes if (each.name in seen) == shown) for shown in (True, False))
+            dots = _board(board, np.array(content["board_circles_target"]), pose)
+            must_find = {label: bool(circle["must_find"]) for label, circle in image["circles"].items()}
+            taken = name, group, number, grey, camera, ideal, pose
+            photographs.append(Photograph(*taken, faces, hidden, dots, must_find))
     assert camera is not None
     return RenderedSet(folder, target, board, camera, truth, tuple(photographs))
 
