@@ -269,9 +269,9 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
     return validated(tags_of_bundle(content, where), TagsFile, where)
 
 
-def placed_corners(data: TagsFile, where: str) -> np.ndarray:
-    """Return the corners (n, 4, 2), mm, NaN where the file states no place. Refuse tags whose sides are in another unit
-    than mm, and tags that lie on each other, for their places are."""
+def placed_corners(data: TagsFile, where: str, every: bool = True) -> np.ndarray:
+    """Return the corners (n, 4, 2), mm, NaN where the file states no place, which it must unless ``every`` is False.
+    Refuse sides in another unit than mm, tags that lie on each other, for their places are, and corners in disorder."""
     sides, corners = [], np.full((len(data.tag), 4, 2), np.nan)
     for k, tag in enumerate(data.tag):
         if (place := tag.corners(where)) is not None:
@@ -282,24 +282,22 @@ def placed_corners(data: TagsFile, where: str) -> np.ndarray:
             sides.append(side(f"side of tag {tag.id} by corners_mm", float(mean_sides(place[None])[0])))
     require_millimetres(sides, data.unusual_size, where)
     require_tags([(tag.dictionary, tag.id) for tag in data.tag], corners, True, where)
+    for tag, place in zip(data.tag, corners, strict=True):
+        if every and np.isnan(place).any():
+            needed = "x_mm, y_mm and size_mm or corners_mm needed, or the file that `stcal locate calibrate` writes"
+            raise InputError("E-TAG-PLACE", f"{where}: tag {tag.id}: no place; {needed}")
+        along = np.roll(place, -1, axis=0) - place
+        following = np.roll(along, -1, axis=0)
+        turn = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
+        if turn.min() <= LEAST_AREA * (along**2).sum(1).max():
+            fault = f"{where}: tag {tag.id}: corners_mm turn the other way, cross or lie on a line"
+            needed = "top left, top right, bottom right, bottom left as printed needed, Y downwards"
+            raise InputError("E-TAG-CORNERS", f"{fault}; {needed}")
     return corners
 
 
 def _tags(data: TagsFile, where: str) -> TagLayout:
     corners = placed_corners(data, where)
-    for tag, place in zip(data.tag, corners, strict=True):
-        place_of_tag = f"{where}: tag {tag.id}"
-        if np.isnan(place).any():
-            raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-        if tag.id >= (count := count_of(tag.dictionary)):
-            raise InputError("E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct it")
-        along = np.roll(place, -1, axis=0) - place
-        following = np.roll(along, -1, axis=0)
-        turn = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
-        if turn.min() <= LEAST_AREA * (along**2).sum(1).max():
-            fault = f"{place_of_tag}: corners_mm turn the other way, cross or lie on a line"
-            needed = "top left, top right, bottom right, bottom left as printed needed, Y downwards"
-            raise InputError("E-TAG-CORNERS", f"{fault}; {needed}")
     with named(where):
         tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
         return TagLayout(tags, corners, data.sigma_mm, data.unusual_size)

@@ -121,11 +121,8 @@ def find_family(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
     """Return the ids and rough corners (4, 2), px, of the tags of a family of :data:`FAMILIES` in an 8-bit image."""
     # AprilTag's corners begin bottom left and turn the other way; the middle of its first pixel is (0.5, 0.5).
     found = _detector(family).detect(np.ascontiguousarray(grey))
-    return [
-        (int(tag.tag_id), np.array(tag.corners, float)[::-1] - 0.5)
-        for tag in found
-        if tag.hamming <= FAMILIES[family].most_wrong
-    ]
+    sure = [tag for tag in found if tag.hamming <= FAMILIES[family].most_wrong]
+    return [(int(tag.tag_id), np.array(tag.corners, float)[::-1] - 0.5) for tag in sure]
 
 
 def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, int], ...]:

@@ -279,7 +279,5 @@ def _why_off(view: BoardView, board: AprilGridDesign, camera: Camera) -> str:
     if _off(replace(view, xyz_board=np.pad(turned.xy_mm()[view.ids], ((0, 0), (0, 1)))), camera).max() <= MAX_OFF_SHARE:
         value = "true" if turned.upright else "false"
         return f"the tags of the AprilGrid are turned by half a turn; write upright = {value} into its file"
-    return (
-        f"{len(view) // 4} tags of the AprilGrid, but not where rows, columns and spacing put them; ids count from the "
-        "bottom left, row by row upwards"
-    )
+    elsewhere = f"{len(view) // 4} tags of the AprilGrid, but not where rows, columns and spacing put them"
+    return f"{elsewhere}; ids count from the bottom left, row by row upwards"

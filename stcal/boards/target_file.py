@@ -486,10 +486,8 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
         outer = int(isinstance(whole, CharucoDesign))  # whose rows and columns are those of squares
         inner = whole.rows - outer, whole.columns - outer
         if all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True)):
-            return (
-                f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
-                "and fewer columns, or tags, needed"
-            )
+            seen = f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too"
+            return f"{seen}; one with more rows and fewer columns, or tags, needed"
     if common := sorted(set(tags_on(first)) & set(tags_on(second))):
         return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
     return ""

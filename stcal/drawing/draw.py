@@ -159,11 +159,8 @@ def paper_sheets(parts: Sequence[Piece], paper: str, title: str) -> list[Sheet]:
     if total > MOST_SHEETS:
         fault = f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}"
         raise InputError("E-DRAW-SHEETS", f"{fault}; take a larger paper, or none")
-    return [
-        sheet
-        for part, way in zip(parts, split, strict=True)
-        for sheet in _tiles(way, f"{title}, {part.name}" if len(parts) > 1 else title)
-    ]
+    titles = [f"{title}, {part.name}" if len(parts) > 1 else title for part in parts]
+    return [sheet for way, own in zip(split, titles, strict=True) for sheet in _tiles(way, own)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -314,8 +314,5 @@ def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
     seen = {each.name: uncertain(each) for each in accepted(results)}
     notes = on_chain(chain, seen)
     found = {name: chain.base_from_goal(name, pose) for name, pose in seen.items()}
-    return Goals(
-        {name: each.rigid for name, each in found.items()},
-        {name: each.covariance for name, each in found.items()},
-        notes,
-    )
+    covariances = {name: goal.covariance for name, goal in found.items()}
+    return Goals({name: goal.rigid for name, goal in found.items()}, covariances, notes)

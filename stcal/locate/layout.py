@@ -116,12 +116,7 @@ def load_layout(path: str | Path) -> TargetLayout:
     """
     where = f"{WHAT} {path}"
     data = load_tags(path, WHAT)
-    plan = _plan(data, where)
-    open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
-    if open_places:
-        fault = f"{where}: tag {open_places[0][1]}: no place"
-        remedy = "x_mm, y_mm and size_mm or corners_mm needed, or the file that `stcal locate calibrate` writes"
-        raise InputError("E-TAG-PLACE", f"{fault}; {remedy}")
+    plan = _plan(data, where, every=True)
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
         corners = in_obj(corners, plan.origin)
@@ -165,8 +160,8 @@ def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turn, -turn @ middle
 
 
-def _plan(data: TagsFile, where: str) -> LayoutPlan:
-    corners, ids = placed_corners(data, where), [tag.id for tag in data.tag]
+def _plan(data: TagsFile, where: str, every: bool = False) -> LayoutPlan:
+    corners, ids = placed_corners(data, where, every), [tag.id for tag in data.tag]
     repeated = [i for i in ids if ids.count(i) > 1]
     if repeated:
         fault = f"{where}: id {repeated[0]} occurs {ids.count(repeated[0])} times"
@@ -175,10 +170,6 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
     if origin not in ids:
         fault = f"{where}: origin {origin}: no tag has this id"
         raise InputError("E-LAYOUT-ORIGIN", f"{fault}; one of {', '.join(map(str, ids))} needed")
-    for tag, place in zip(data.tag, corners, strict=True):
-        if np.isfinite(place).all() and np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
-            fault = f"{where}: tag {tag.id}: corners go round the wrong way"
-            raise InputError("E-TAG-CORNERS", f"{fault}; top left, top right, … needed")
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)

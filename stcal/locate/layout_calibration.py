@@ -331,17 +331,11 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     # A tag's corners err as measured, and by the edges' common shift.
     direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
     shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
-    return ImageCorners(
-        name,
-        refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen),
-        view.xyz_board,
-        board_seen,
-        seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
-        np.array([rows[found.tags[k]] for k in own]),
-        camera.normalised_from_pixel(found.corners_px[own].reshape(-1, 2)),
-        shift + found.joint_px2[own],
-        float(camera.focal.mean()),
-    )
+    pose = refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen)
+    board = view.xyz_board, board_seen, seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2)
+    tags_seen = camera.normalised_from_pixel(found.corners_px[own].reshape(-1, 2))
+    tags = np.array([rows[found.tags[k]] for k in own]), tags_seen, shift + found.joint_px2[own]
+    return ImageCorners(name, pose, *board, *tags, float(camera.focal.mean()))
 
 
 def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
@@ -387,16 +381,9 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
     ends = ([in_obj((flat + sign * step).reshape(-1, 4, 2), origin).ravel() for step in steps] for sign in (1, -1))
     by_corner = np.subtract(*map(np.array, ends)).T / (2 * STEP_MM)
     covariance = by_corner @ adjusted.covariance_mm2 @ by_corner.T
-    layout = TargetLayout(
-        plan.name,
-        tuple(plan.tags[row] for row in tag_rows),
-        adjusted.corners_mm @ turn.T + shift,
-        (covariance + covariance.T) / 2,
-        origin,
-        adjusted.sigma_px,
-        adjusted.tag_sigma_px,
-        plan.unusual_size,
-    )
+    tags, corners = tuple(plan.tags[row] for row in tag_rows), adjusted.corners_mm @ turn.T + shift
+    known = tags, corners, (covariance + covariance.T) / 2, origin, adjusted.sigma_px, adjusted.tag_sigma_px
+    layout = TargetLayout(plan.name, *known, plan.unusual_size)
     obj_from_board = Rigid(np.asarray(block_diag(turn, 1.0)), np.append(shift, 0.0))
     nominal = plan.corners_mm[tag_rows]
     placed, deviation = np.isfinite(nominal).all((1, 2)), np.full(len(nominal), np.nan)
@@ -404,17 +391,11 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         pair = layout.corners_mm, nominal
         a, b = (np.pad(each[placed].reshape(-1, 2), ((0, 0), (0, 1))) for each in pair)
         deviation[placed] = np.linalg.norm(align_rigid(a, b) @ b - a, axis=1).reshape(-1, 4).max(1)
-    return CalibratedLayout(
-        layout,
-        in_obj(start, origin),
-        obj_from_board.inverse(),
-        adjusted,
-        tuple(image.name for image in images),
-        np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows)),
-        tuple(row for row in range(len(plan.tags)) if row not in tag_rows),
-        deviation,
-        tuple(left_out),
-    )
+    names = tuple(image.name for image in images)
+    counts = np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows))
+    unseen = tuple(row for row in range(len(plan.tags)) if row not in tag_rows)
+    result = layout, in_obj(start, origin), obj_from_board.inverse(), adjusted
+    return CalibratedLayout(*result, names, counts, unseen, deviation, tuple(left_out))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

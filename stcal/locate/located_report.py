@@ -266,10 +266,8 @@ def calibrated_text(result: CalibratedLayout) -> str:
             [str(tag), name, result.counts[row], number(side[row], 3), *um, number(result.deviation_mm[row], 3)]
         )
     heads = ["id", "<dictionary", "images", "side_mm", "sigma_um", "adjusted by_um", "from nominal_mm"]
-    about = (
-        f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
-        f"{adjusted.tag_rms_px:.3f} px of the tags"
-    )
+    residuals = f"{adjusted.board_rms_px:.3f} px of the board, {adjusted.tag_rms_px:.3f} px of the tags"
+    about = f"{len(result.images)} images, {len(layout.tags)} tags; residuals {residuals}"
     blocks = [
         f"beside the corners' own σ: {adjusted.sigma_px:.3f} px each, {adjusted.tag_sigma_px:.3f} px a tag as a whole",
         *stretch_in_words("the board", adjusted.stretch, adjusted.shear),

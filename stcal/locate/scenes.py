@@ -224,14 +224,8 @@ def capture(
         images.append(image)
         if taken:
             taken(row)
-    content = CaptureFile(
-        format="stcal capture 1",
-        version=stcal.__version__,
-        camera=source.name,
-        gain=gain,
-        settle_s=settle_s,
-        exposures=rows,
-    )
+    own = {"format": "stcal capture 1", "version": stcal.__version__, "camera": source.name}
+    content = CaptureFile.model_validate({**own, "gain": gain, "settle_s": settle_s, "exposures": rows})
     folder.mkdir(parents=True)
     for row, image in zip(rows, images, strict=True):
         save(folder / row.image, png(image))
@@ -389,10 +383,8 @@ def locate_scene(
         return rejected(f"exposures of different sizes ({shown} px); one size needed, as the camera file's")
     width, height = used[0].size
     if (camera.width or width, camera.height or height) != (width, height):
-        return rejected(
-            f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
-            "give the camera that took them"
-        )
+        fault = f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px"
+        return rejected(f"{fault}; give the camera that took them")
     merged = merge([exposure.tags for exposure in used], layout, [exposure.name for exposure in used])
     unknown = ", ".join(str(tag) for _, tag in merged.unknown[:5]) + (", …" if len(merged.unknown) > 5 else "")
     if unknown:
@@ -405,9 +397,8 @@ def locate_scene(
     ]
     if not len(merged.seen):
         if unknown:
-            return rejected(
-                f"no tag of the layout, but others of its dictionaries ({unknown}); is it the layout of this target?"
-            )
+            others = f"no tag of the layout, but others of its dictionaries ({unknown})"
+            return rejected(f"{others}; is it the layout of this target?")
         shown = seen_otherwise(image_of(used[0].name), layout.rows(), "the layout file")
         more = f", and {used[0].name} shows {shown}" if shown else ""
         return rejected(f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed{more}")
@@ -418,10 +409,9 @@ def locate_scene(
     if moved:
         shift = max(moved, key=lambda shift: shift.shift_px)
         further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
-        return rejected(
-            f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
-            f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
-        )
+        by = f"{shift.tags} tags by {shift.shift_px:.2f} px{further_pairs}"
+        fault = f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {by}"
+        return rejected(f"{fault}; take the exposures with camera and target at rest")
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
 
     def mistakes(seen: SeenTags, pose: ObjPose | None) -> list[str]:

@@ -73,10 +73,8 @@ def order_note(change: Change, problem: Problem) -> str:
         return f"one frame drifts against the other along the rows, by {size} from the first to the last ({share})"
     first, row, last = (problem.name(row) for row in (change.first, change.row, change.last))
     likely = f" ({first} to {last} as likely)" if first != last else ""
-    return (
-        f"from {row} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows before it, and "
-        "those from it on, separately"
-    )
+    moved = f"from {row} on{likely} an instrument stands elsewhere, by {size} ({share})"
+    return f"{moved}: register the rows before it, and those from it on, separately"
 
 
 TRIED = 200  # largest number of points that are examined for groups
@@ -436,10 +434,8 @@ def notes_of(result: Registration, problem: Problem, other: Wider | None, shifte
             "right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
         )
     if result.sigma_factor is not None and result.scaled:
-        yield (
-            f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance; the covariance is "
-            f"scaled by this factor"
-        )
+        excess = f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance"
+        yield f"{excess}; the covariance is scaled by this factor"
     enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
     if len(inside) <= enough and result.scaled:
         yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
@@ -466,10 +462,9 @@ def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
         bound = square.sum() / redundancy * 3 * ratio_limit(consensus.CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
         if square.max() > bound:
             worst = int(square.argmax())
-            yield (
-                f"{(square > bound).sum()} points lie farther off than noise would put them, the farthest "
-                f"{problem.name(worst)} at {np.sqrt(square[worst]):.4g} mm; use the robust method"
-            )
+            farthest = f"the farthest {problem.name(worst)} at {np.sqrt(square[worst]):.4g} mm"
+            far = f"{(square > bound).sum()} points lie farther off than noise would put them"
+            yield f"{far}, {farthest}; use the robust method"
 
 
 def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator[str]:
@@ -494,7 +489,5 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
         angle, to = found
         moved = np.flatnonzero(to != np.arange(len(to)))
         names = consensus.some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
-        yield (
-            f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names}); "
-            "labels exchanged like that would fit as well, so check that rows are the same points"
-        )
+        like_it = f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names})"
+        yield f"{like_it}; labels exchanged like that would fit as well, so check that rows are the same points"

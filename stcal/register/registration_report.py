@@ -29,10 +29,8 @@ def registration_report(found: Findings, more: Sequence[Section] = ()) -> Docume
     """Returns the report of ``register``. ``more`` : sections to insert before the rows."""
     count, outliers = len(found), len(found.outliers)
     cut = "" if found.threshold_mm is None else f", threshold {found.threshold_mm:.4g} mm"
-    about = (
-        f"{found.pairs}: {count} point pairs, {found.model}, {found.method}{cut}: {count - outliers} inliers, "
-        f"{outliers} outliers"
-    )
+    groups = f"{count - outliers} inliers, {outliers} outliers"
+    about = f"{found.pairs}: {count} point pairs, {found.model}, {found.method}{cut}: {groups}"
     errors, held = [("residuals of the inliers", found.inlier_errors)], found.held_out
     if held is not None:
         errors.append((f"held out ({held.folds} folds), inliers", held.of_inliers))
@@ -145,10 +143,8 @@ def _field_sentence(found: Findings, field: Field) -> str:
             "not use this transform"
         )
     if not field.seen:
-        return (
-            f"no systematic residuals seen: they look like noise of σ {field.noise_mm:.3g} mm "
-            f"(chance of as much structure: {field.p_value:.2g})"
-        )
+        noise = f"noise of σ {field.noise_mm:.3g} mm (chance of as much structure: {field.p_value:.2g})"
+        return f"no systematic residuals seen: they look like {noise}"
     back = len(field.taken_back)
     taken = f"; {back} of the outliers follow{'s' * (back == 1)} it" if back else ""
     return (

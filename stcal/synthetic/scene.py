@@ -293,15 +293,10 @@ def made_group(pair, target, board, camera, target_from_face, circles, options, 
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
     axes = viewing_axes(normals[0], normals[1], f"group {name}")
     dots = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
-    shape = GroupShape(
-        f"group {name}",
-        np.array([circles[label] for row in labels for label in row]),
-        np.repeat(normals, [len(row) for row in labels], axis=0),
-        axes,
-        np.vstack([target_from_face[face.id] @ _face_corners(face, options.margin_mm) for face in target.faces]),
-        dots,
-        _board_rectangle(board),
-    )
+    centres = np.array([circles[label] for row in labels for label in row])
+    plates = [target_from_face[face.id] @ _face_corners(face, options.margin_mm) for face in target.faces]
+    faces = centres, np.repeat(normals, [len(row) for row in labels], axis=0), axes, np.vstack(plates)
+    shape = GroupShape(f"group {name}", *faces, dots, _board_rectangle(board))
     target_from_board, views = place_group(
         shape, camera, options.images_per_group, options.distance_mm, np.radians(options.spread_deg), rng
     )
@@ -340,12 +335,10 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid], marg
             face_from_target = target_from_face[front.id].inverse()
             height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face, margin_mm)))[:, 2].max()
             if height > CONVEX_TOLERANCE_MM:
-                plate = (
-                    f"its plate is assumed to reach {margin_mm:g} mm beyond its circles; state its outline_mm in the "
-                    "target file, or a smaller --margin-mm, or"
-                    if face.outline_mm is None
-                    else "simulated targets must be convex;"
-                )
+                plate = "simulated targets must be convex;"
+                if face.outline_mm is None:
+                    plate = f"its plate is assumed to reach {margin_mm:g} mm beyond its circles"
+                    plate += "; state its outline_mm in the target file, or a smaller --margin-mm, or"
                 fault = f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may hide it"
                 raise DegenerateError("E-SCENE-FACES", f"{fault}: {plate} check the rough poses")
 

@@ -71,14 +71,9 @@ def test_what_was_really_set_is_written(driver, tmp_path):
 
 
 def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
-    for name, value, said in (
-        ("takes_exposure", False, "E-DEVICE-SETTING … 10"),
-        ("ends_after", 4, "E-DEVICE-NO-IMAGE"),
-    ):
-        before = getattr(driver, name)
-        setattr(driver, name, value)
+    for said in ("E-DEVICE-SETTING … 10", "E-DEVICE-NO-IMAGE"):
+        driver.takes_exposure, driver.ends_after = said == "E-DEVICE-NO-IMAGE", 4
         refuses(said, capture, OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", None, 0.0)
-        setattr(driver, name, before)
         assert not (tmp_path / "a").exists()
     driver.takes_gain = False
     refuses("E-DEVICE-SETTING", OpenCVSource, "0", 3.0)
