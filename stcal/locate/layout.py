@@ -161,7 +161,7 @@ def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plan(data: TagsFile, where: str, every: bool = False) -> LayoutPlan:
-    corners, ids = placed_corners(data, where, every), [tag.id for tag in data.tag]
+    ids = [tag.id for tag in data.tag]
     repeated = [i for i in ids if ids.count(i) > 1]
     if repeated:
         fault = f"{where}: id {repeated[0]} occurs {ids.count(repeated[0])} times"
@@ -170,6 +170,7 @@ def _plan(data: TagsFile, where: str, every: bool = False) -> LayoutPlan:
     if origin not in ids:
         fault = f"{where}: origin {origin}: no tag has this id"
         raise InputError("E-LAYOUT-ORIGIN", f"{fault}; one of {', '.join(map(str, ids))} needed")
+    corners = placed_corners(data, where, every)
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)

@@ -1,6 +1,7 @@
 """AprilGrids as Kalibr prints them: every corner where the drawing puts it, whatever the border and the squares."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ CORNER_PX = 0.12  # as in the tests of the other boards
 GRID = AprilGridDesign(3, 4, 30.0, 0.3)
 
 
+@cache
 def photographed(board: AprilGridDesign, border: int, squares: bool = True) -> tuple[np.ndarray, np.ndarray]:
     sheet, origin = aprilgrid_mm(board, border, squares)
     return photograph(sheet, 4, IMAGE_FROM_MM), origin
