@@ -235,8 +235,8 @@ def locate(
         start = minima.poses[[0]]
     pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
-        fault = f"{where}: its tags do not determine the rotation"
-        raise DegenerateError("E-LOCATE-OPEN", f"{fault}; show more tags, or larger ones")
+        undetermined = f"{where}: its tags do not determine the rotation"
+        raise DegenerateError("E-LOCATE-OPEN", f"{undetermined}; show more tags, or larger ones")
     return pose
 
 

@@ -329,15 +329,15 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     off_line, root = float(np.hypot(spread[1], spread[2])), np.sqrt(n)
     if n > model.needed and spread[0] < needed:
         raise by_chance(n, n, sigma_mm)
-    shapes = [("E-POINTS-COLLINEAR", off_line, "along a line", "", "measure points off the line")]
-    if model == AFFINE:
+    if off_line < needed:
+        lie = f"along a line, {off_line / root:.4g} mm RMS off it ({spread[0] / root:.4g} mm along it)"
+        least = f"{needed / root:.4g} mm needed at σ {sigma_mm:.4g} mm; measure points off the line"
+        raise DegenerateError("E-POINTS-COLLINEAR", f"registration: the {n} points lie {lie}; {least}")
+    if model == AFFINE and spread[2] < needed:
+        lie = f"in a plane, {spread[2] / root:.4g} mm RMS off it ({spread[0] / root:.4g} mm along it)"
+        least = f"{needed / root:.4g} mm needed for the affine model at σ {sigma_mm:.4g} mm"
         remedy = "measure points off the plane, or use the rigid model"
-        shapes.append(("E-POINTS-COPLANAR", spread[2], "in a plane", " for the affine model", remedy))
-    for code, off, shape, purpose, remedy in shapes:
-        if off < needed:
-            fault = f"the {n} points lie {shape}, {off / root:.4g} mm RMS off it ({spread[0] / root:.4g} mm along it)"
-            least = f"{needed / root:.4g} mm needed{purpose} at σ {sigma_mm:.4g} mm"
-            raise DegenerateError(code, f"registration: {fault}; {least}; {remedy}")
+        raise DegenerateError("E-POINTS-COPLANAR", f"registration: the {n} points lie {lie}; {least}; {remedy}")
 
 
 def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:

@@ -335,10 +335,9 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid], marg
             face_from_target = target_from_face[front.id].inverse()
             height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face, margin_mm)))[:, 2].max()
             if height > CONVEX_TOLERANCE_MM:
-                plate = "simulated targets must be convex;"
-                if face.outline_mm is None:
-                    plate = f"its plate is assumed to reach {margin_mm:g} mm beyond its circles"
-                    plate += "; state its outline_mm in the target file, or a smaller --margin-mm, or"
+                assumed = f"its plate is assumed to reach {margin_mm:g} mm beyond its circles"
+                plate = f"{assumed}; state its outline_mm in the target file, or a smaller --margin-mm, or"
+                plate = plate if face.outline_mm is None else "simulated targets must be convex;"
                 fault = f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may hide it"
                 raise DegenerateError("E-SCENE-FACES", f"{fault}: {plate} check the rough poses")
 
