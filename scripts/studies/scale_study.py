@@ -24,7 +24,8 @@ from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.stages import Groups, solve_groups
+from stcal.sfm.runs.stages import Groups, Task, map_groups
+from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import simulate_centres
 
@@ -77,13 +78,13 @@ def measure(count: int, kind: str) -> dict:
     marks, processor = [("start", time.perf_counter())], time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        (out / "cache").mkdir()
         graph = image_graph(observations, scene.board, kind)
         marks.append(("graph", time.perf_counter()))
         labelled = tuple(LabelledImage(image, ()) for image in observations)
-        groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
-        solved, _ = solve_groups(groups, scene.target, out / "scratch", out / "cache", lambda *_: None)
-        solutions = list(solved.values())
+        names = tuple(sorted(scene.groups))
+        groups = Groups(labelled, names, graph, scene.camera, scene.board, options, False, ())
+        task = Task(([], []), RunFolder(out, out, out), scene.target, scene.board, options, lambda *_: None)
+        solutions = map_groups(task, groups).solutions
         marks.append(("map", time.perf_counter()))
         adjustment = options.adjustment(scene.target)
         result = calibrate([s.model for s in solutions], scene.camera, scene.target, scene.board, adjustment)

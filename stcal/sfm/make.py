@@ -33,9 +33,7 @@ from stcal.sfm.planning.session import Plan, PlanOptions, plan
 from stcal.synthetic.designs import Body, face_of_drawing, tag_body
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
-EDGE_SHARE = 0.06
-"""Width of the margin along the rim of a plate that stays free of circles, as a share of the plate's shorter side. It
-leaves room to cut, fold and glue."""
+EDGE_SHARE = 0.06  # margin along a plate's rim without circles, to cut, fold and glue, over its shorter side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,17 +87,13 @@ def require_size(size_mm: Sequence[float]) -> None:
         raise InputError("E-OPTION-RANGE", f"--size {size}: sides of 1 mm to 100 m needed, in mm")
 
 
-HIDDEN = 3
-"""Number of circles of a face that may be hidden. Any set of the remaining circles identifies the face."""
+HIDDEN = 3  # circles of a face that may be hidden: any set of the others identifies it
 LEAST_CIRCLES = MIN_NAMING + HIDDEN
-LARGE = 1.6
-"""Radius of the larger circles as a multiple of the smaller radius. Detection takes radii up to a ratio of 1.3 for
-equal."""
+LARGE = 1.6  # larger radius over the smaller; detection takes radii up to a ratio of 1.3 for equal
 GAP = 0.8  # least gap between the rims of two circles, in radii of the smaller circles
 PLACES, TRIES = 40, 30  # numbers of candidate places for each circle, and of candidate patterns for each face
 GRID_MM = 0.5  # grid of the coordinates of circles, so that they are round numbers that can be measured again
-CORNER_SHARE = 0.15
-"""Size of the area at each corner in which a circle of the frame lies, as a share of the plate's sides."""
+CORNER_SHARE = 0.15  # area at each corner in which a circle of the frame lies, over the plate's sides
 
 
 def make_pattern(
@@ -202,20 +196,15 @@ def _seen(face: FaceDesign, target: TargetDesign, camera: Camera, distance_mm: f
 
 
 FARTHER = 1.1  # largest distance of a camera, as a multiple of the stated distance
-WELL_SEEN = 1.5
-"""Least ratio of the smallest circle's diameter, where it is most tilted and farthest away, to the smallest diameter
-that detection looks for."""
+WELL_SEEN = 1.5  # least ratio of the smallest diameter, farthest and most tilted, to that which detection looks for
 RADIUS_SHARE = 1 / 30  # default radius of the smaller circles, as a share of the box's shortest side
 RADIUS_STEP_MM = 0.25
-PITCH_SHARE = 0.23
-"""Pitch of the board, as a share of the box's longest side. The board then reaches beyond the box on all sides."""
-FIELD_SHARE = 0.8
-"""Share of the width that the camera sees at the stated distance, in which box and board stand side by side."""
+PITCH_SHARE = 0.23  # of the board, over the box's longest side: it then reaches beyond the box on all sides
+FIELD_SHARE = 0.8  # of the width in view at the stated distance, in which box and board stand side by side
 PITCH_STEP_MM = 5.0
 ATTEMPTS = 8  # largest number of patterns drawn until one is identified in all cases
 ROWS, COLUMNS = 7, 9
-BOARD_SIGMA_MM = 0.02
-"""Position error of dots that a good printer prints. A milled or photographic plate states its own."""
+BOARD_SIGMA_MM = 0.02  # of dots that a good printer prints; a milled or photographic plate states its own
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -49,10 +49,8 @@ PLAIN = (
     "the faces are too few or too small in these images, or in their middle alone, to tell the lens's distortion and "
     "principal point: they are held near none, and near the middle; give --camera, or photograph the faces larger"
 )
-Images = str | Path | Mapping[str, Sequence[np.ndarray]]
-"""A folder of images, or grey or RGB arrays by the name of their group."""
-OwnCheck = Callable[[RunResult], Check]
-"""A check that the caller supplies."""
+Images = str | Path | Mapping[str, Sequence[np.ndarray]]  # a folder, or grey or RGB arrays by group
+OwnCheck = Callable[[RunResult], Check]  # a check that the caller supplies
 
 
 @require_arguments

@@ -118,11 +118,17 @@ def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
     assert judged.next.startswith("Check the sizes.")
 
 
-@pytest.mark.parametrize(("faces", "factor"), [((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)])
-def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(faces, factor):
-    """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
+@pytest.fixture(scope="module")
+def photographed():
+    """The cube's scene, and its corners in 16 images."""
     scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
-    images, _ = corners_seen(scene, 0.02)
+    return scene, corners_seen(scene, 0.02)[0]
+
+
+@pytest.mark.parametrize(("faces", "factor"), [((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)])
+def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(photographed, faces, factor):
+    """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
+    scene, images = photographed
     rng = np.random.default_rng(0)
     noisy = [replace(each, centre_px=each.centre_px + rng.normal(0, 0.02, each.centre_px.shape)) for each in images]
     rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
@@ -141,9 +147,8 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(face
         place_with_camera(noisy, drawn, rough)
 
 
-def test_of_two_faces_none_is_blamed_for_its_size():
-    scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
-    images, _ = corners_seen(scene, 0.02)
+def test_of_two_faces_none_is_blamed_for_its_size(photographed):
+    scene, images = photographed
     one, two = (next(face for face in CUBE.faces if face.id == name) for name in ("1", "5"))
     with fails_with("E-BODY-SIZES … faces 1 and 5 contradict one another … face 5 is 10 times as large against face 1"):
         place_with_camera(images, [one, replace(two, xy_mm=two.xy_mm / 10)], scene.camera)

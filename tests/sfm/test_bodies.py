@@ -43,6 +43,8 @@ from tests.support.image_poses import pose_error
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
+THREE = tag_body("cube", "60", "APRILTAG_36h11", 0, "1,2,3")
+"""A cube with tags on three faces alone, of which few images show each often enough."""
 TARGET = """name = "mixed"
 [[face]]
 id = "0"
@@ -268,17 +270,15 @@ def test_faces_that_are_hardly_seen_are_named():
     shown = [face.id for image in range(2) for face in scene.faces_in_view(image)]
     for face in scene.target.faces:
         assert f"{face.id} ({shown.count(face.id)} of 2 images" in scene.hardly_seen()
-    target = tag_cube(60)
-    planned = plan(PlanOptions(10, distance_mm=300, width=900), target)
-    assert "hardly seen: face" in plan_text(planned, "")
+    assert "hardly seen: face" in plan_text(plan(PlanOptions(4, distance_mm=300, width=900), THREE), "")
 
 
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
-    target, near = tag_cube(60), 145.0
-    options = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
-    forecast, _, _ = planned_photographs(options, target)
-    simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
+    near = 145.0
+    options = PlanOptions(images=4, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    forecast, _, _ = planned_photographs(options, THREE)
+    simulated = make_body_scene(THREE, body_camera(900), BodyOptions(4, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
     assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())
@@ -296,8 +296,7 @@ def test_the_distance_that_a_body_needs_is_named():
 
 
 def test_more_images_and_a_known_distance_help_a_planned_body():
-    target = tag_cube(60)
-    planned = plan(PlanOptions(images=12, distance_mm=300, width=900, seed=1), target)
+    planned = plan(PlanOptions(images=6, distance_mm=300, width=900, seed=1), THREE)
     worst = planned.forecast.worst()[1]
     remedies = {remedy.what: remedy.sigma_mm for remedy in planned.remedies}
     assert set(planned.shares["2"]) == {"image noise", "print", "flatness", "intrinsics"}

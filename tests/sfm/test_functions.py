@@ -25,11 +25,13 @@ def written_json(stcal_sfm, out, *words) -> dict:
 
 
 def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
+    """Of a run just made, and of its folder."""
     words = "budget", small_run, "--field", "operator=A", "--no-strict"
     answer = written_json(stcal_sfm, tmp_path / "a.json", *words)
     found = sfm.uncertainty_budget(small_result, fields={"operator": "A"})
     assert json.loads(json_text(found.file)) == answer
     assert found.file.fields["operator"] == "A"
+    assert set(answer["faces"]) == {"2", "4", "5"}
     assert "A" in found.document().text()
     with fails_with("E-OPTION-VALUE … 62"):
         sfm.uncertainty_budget(small_run, fields={61 * "n": ""})
@@ -75,10 +77,10 @@ def test_design_target(stcal_sfm, monkeypatch, tmp_path):
 
 
 def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
-    words = "--images", "6", "--distance", "300", "--width", "900"
+    words = "--faces", "1,2,3", "--images", "4", "--distance", "300", "--width", "900"
     _, said, _ = stcal_sfm("design", tmp_path / "one", "--tags", "cube", "--size", "50", *words)
-    session = sfm.PlanOptions(6, distance_mm=300.0, width=900)
-    found = sfm.design_tag_body("cube", 50.0, session=session)
+    session = sfm.PlanOptions(4, distance_mm=300.0, width=900)
+    found = sfm.design_tag_body("cube", 50.0, session=session, faces="1,2,3")
     assert plan_text(found.forecast, found.source) in said
     assert found.files == ()
     target = stcal.load_target(tmp_path / "one" / "target.toml")

@@ -32,7 +32,7 @@ from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, writ
 from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
-from stcal.sfm.report.judgement import with_judgement
+from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.comparisons import (
     CameraRow,
     Crosscheck,
@@ -286,7 +286,7 @@ def crosscheck(
             raise InputError("E-RUN-REPLACED", f"{fault}; cross-check it again")
         check = compared()
         report = saved.report | {"crosscheck": check.model_dump(exclude_unset=True)}
-        write_report(stage, with_judgement(report), saved.folder)
+        write_report(stage, report | {"judgement": judgement_of(report).model_dump()}, saved.folder)
     return check
 
 

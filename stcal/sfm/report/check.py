@@ -8,8 +8,7 @@ from stcal.geometry.arrays import Brief, require_fields
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 ORDER: tuple[Verdict, ...] = ("failed", "suspicious", "passed", "not possible")
-NOT_APPLICABLE = "not applicable"
-"""What is told of checks that what was photographed has nothing for, such as those of circles where it shows tags."""
+NOT_APPLICABLE = "not applicable"  # as checks of circles where the photographs show tags
 SUSPICIOUS = 1e-3  # limit of the probability that, among all values of a check, one is as large by chance
 FAILED = 1e-5
 BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"

@@ -21,15 +21,11 @@ from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
 LABELS = ("labels.csv", "detections.csv")  # labels of a run, and of a detection alone
-NEAR_PX = 1.5
-"""Largest distance of a label's ellipse centre from the image of the circle's centre, in px, at which the label is
-right. Eccentricity makes 0.2."""
+NEAR_PX = 1.5  # from a label's ellipse centre to the true circle centre's image; eccentricity makes 0.2
 
 MOST_LISTED = 20  # largest number of images that the table of poses has a row for
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
-OF_A_UNIT = 0.1
-"""Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
-worst."""
+OF_A_UNIT = 0.1  # relative deviation of a ratio of distances from a unit's factor; runs are off by a few per cent
 
 
 class ComparedFaces(Part):

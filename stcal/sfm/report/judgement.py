@@ -16,8 +16,7 @@ from stcal.sfm.data.group_model import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN
 from stcal.sfm.report.check import CAUSE, SUSPICIOUS, Check, invalidated, ranked
 
 TAIL = 2.0  # ratio of a face's σ to the median of the others above which this face limits the result by itself
-PHOTOGRAPHS = ("circles", "dots")
-"""Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
+PHOTOGRAPHS = ("circles", "dots")  # the sources that more photographs make smaller, others hardly
 MOST_PPM = 1000.0  # relative σ, in ppm, from which it is stated in %
 MORE = 4  # how many times the images the answer gives σ for
 FEW_IMAGES = 6  # number of photographs below which more of them are the first thing to do
@@ -28,8 +27,7 @@ QUESTIONS = {
     "next": "What to do next?",
 }
 Use = Literal["yes", "with care", "part", "no"]
-TESTED_BY = {"labels", "agreement"}
-"""Keys of the checks of which one at least must be possible for σ to be tested at all."""
+TESTED_BY = {"labels", "agreement"}  # σ are tested if one of these checks is possible
 UNKNOWN_SIZE = "nothing of known size is in view, and its size is that of the drawing"
 SIZES = {
     "board": "the board's pitch",
@@ -98,13 +96,7 @@ class Judgement(Part):
         return [(question, getattr(self, key)) for key, question in QUESTIONS.items()]
 
 
-Cause = tuple[str, str]
-"""What limits a result, and the remedy."""
-
-
-def with_judgement(report: dict) -> dict:
-    """Returns the content of ``report.json`` with a new judgement."""
-    return report | {"judgement": judgement_of(report).model_dump()}
+Cause = tuple[str, str]  # what limits a result, and the remedy
 
 
 def judgement_of(report: dict) -> Judgement:
@@ -137,16 +129,13 @@ def judgement_of(report: dict) -> Judgement:
     )
 
 
-def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
-    """Returns the rows of the faces without σ, which a failed run must not show."""
-    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
-    return {name: face | none for name, face in faces.items()}
-
-
 def without_sigma(report: dict) -> dict:
+    """Returns the content of ``report.json`` without the σ of faces, which a failed run must not show."""
+    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
+    faces = {name: face | none for name, face in report["faces"].items()}
     between = [row | {"distance_sigma_um": None} for row in report["between_faces"]]
     summary = report["summary"] | {"scale_sigma_ppm": None}
-    return report | {"faces": without_sigma_of(report["faces"]), "between_faces": between, "summary": summary}
+    return report | {"faces": faces, "between_faces": between, "summary": summary}
 
 
 def _faces(names: list[str]) -> str:
@@ -182,7 +171,7 @@ class _Run:
         if verdict != "no" and self.has_no_size:
             verdict, begin, reasons = "with care", "With care, for its shape alone", [UNKNOWN_SIZE, words]
         reasons += [note["words"] for note in self.drawn[:1]]
-        if verdict == "yes" and (self.drawn or (gaps and self.lost)):
+        if verdict == "yes" and (self.drawn or self.lost):
             verdict = "with care"
         reserved = verdict == "with care"
         if verdict != "no" and self.lacking:

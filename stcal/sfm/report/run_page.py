@@ -38,8 +38,7 @@ from stcal.sfm.report.run_figures import board_residuals, by_photograph, halves,
 
 FIRST_IMAGES = 100  # number of rows and overlays that the page has room for
 LONGEST = 0.04  # length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width
-Residuals = np.ndarray
-"""Array (n, 6) of circles: centre x, y and residual x, y, px; residual x, y over its σ."""
+Residuals = np.ndarray  # (n, 6) of circles: centre x, y and residual x, y, px; residual x, y over its σ
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",

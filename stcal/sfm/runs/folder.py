@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -49,7 +48,7 @@ from stcal.sfm.detect.predict import CUT, REMEDIES
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
-from stcal.sfm.report.judgement import QUESTIONS, Judgement, with_judgement, without_sigma_of
+from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
 from stcal.sfm.report.run_page import (
     CONTROL,
     FIRST_IMAGES,
@@ -59,7 +58,7 @@ from stcal.sfm.report.run_page import (
     report_html,
     shown_overlays,
 )
-from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
+from stcal.sfm.runs.report_file import ReportFile, report_of
 from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun
 from stcal.sfm.runs.stages import DetectedImages, Task
 from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, require_run, verify
@@ -129,8 +128,8 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     ids, by_name = image_ids(observations), {image.name: image for image in observations}
     keypoints = {name: image.centre_px for name, image in by_name.items()}
     for model in models.values():  # as the models of the groups correct them
-        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            keypoints[name] = model.keypoints_px(by_name[name], rows)
+        rows_of = zip(model.images, model.rows_by_image(), strict=True)
+        keypoints |= {name: model.keypoints_px(by_name[name], rows) for name, rows in rows_of}
     corrected = list(keypoints.values())
     (out / files.DATABASE).parent.mkdir()
     write_database(out / files.DATABASE, result.camera, observations, result.graph.pairs, corrected)
@@ -145,8 +144,9 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> RunResult:
     save_target(out / files.TARGET, result.target_design)
     if result.board_design.rows:
         save_board(out / files.BOARD, result.board_design)
-    report, faces = with_judgement(report_of(result).content()), None
-    judgement = Judgement.model_validate(report["judgement"])
+    report, faces = report_of(result).content(), None
+    judgement = judgement_of(report)
+    report["judgement"] = judgement.model_dump()
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
@@ -268,19 +268,18 @@ def require_report(saved: SavedRun) -> None:
 
 def _page_on_failure(name: str, error: StcalError, found: str, seen: DetectedImages) -> str:
     """Returns the page of a run without a result; the overlays lie beside it."""
-    rows: list[list[Any]] = []
-    for image in seen.observations:
-        dots = _count_dots(image)
-        rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
+    counts = [(image, _count_dots(image)) for image in seen.observations]
+    rows = [[image.name, join(sorted(image.face_ids())), len(image) - dots, dots] for image, dots in counts]
     left_out = [f"{each.observations.name}: {note}" for each in seen.labelled for note in each.notes]
-    overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
-    shown = [macro("plot", place, image, image) for place, image in overlays[:FIRST_IMAGES]]
+    overlays = [(overlay_path(Path(), image.name).as_posix(), image.name) for image, _ in counts]
+    shown, others = overlays[:FIRST_IMAGES], overlays[FIRST_IMAGES:]
+    pictures = plots(*(macro("plot", place, image, image) for place, image in shown))
     sections = [
         *([Section("What to do", [sentence(error.remedy)])] if error.remedy else []),
         Section("What was found", [found, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in seen.detection.skipped])]),
-        Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
+        Section("Overlays", [pictures, links(others) if others else None]),
     ]
     return Document(name, f"{len(rows)} images, no calibrated target", sections, [Answer("no", error.fault)]).page()
 
@@ -291,12 +290,12 @@ def run_text(result: RunResult) -> str:
 
 def document_of(result: RunResult) -> Document:
     """Returns the result of a run in short: the verdict, faces with σ, checks that did not pass, and remarks."""
-    verdict, *others = [] if result.judgement is None else result.judgement.answers()
-    faces = {face: face_row(result, face) for face in result.target.target_from_face}
+    judgement, comparison = Judgement.model_validate(result.report["judgement"]), result.comparison
+    faces = (without_sigma(result.report) if judgement.verdict == "no" else result.report)["faces"]
+    first, *others = judgement.answers()
+    blocks: list[Block]
     if faces:
-        failed = result.judgement is not None and result.judgement.verdict == "no"
-        shown = without_sigma_of(faces) if failed else faces
-        blocks: list[Block] = [faces_table(shown, result.target.reference_face)]
+        blocks = [faces_table(faces, result.target.reference_face)]
     else:
         rows = [
             [name, len(s.labels)]
@@ -313,20 +312,19 @@ def document_of(result: RunResult) -> Document:
     doubtful = [check for check in ranked(result.checks, names) if check.verdict in ("failed", "suspicious")]
     blocks += [f"checks: {count_verdicts(result.checks)} ({BY_CHANCE})"] if doubtful else []
     blocks += [f"{c.verdict}: {c.title}: {c.reason}{'; ' * bool(c.remedy)}{c.remedy}" for c in doubtful]
-    if result.comparison is not None:
+    if comparison is not None:
         blocks += [
             "compared with Zhang & Wei (2017): distance of faces from the last row's, three-point frames; steps add up",
-            Table(*comparison_cells(result.comparison.model_dump())),
-            *(f"{row.method}: {row.reason}" for row in result.comparison.rows if row.reason),
+            Table(*comparison_cells(comparison.model_dump())),
+            *(f"{row.method}: {row.reason}" for row in comparison.rows if row.reason),
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
     if (out := result.out) is not None:
         written = [f"faces:  {out / 'faces.json'}"] if faces else []
         written += [f"camera: {out / files.REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
         blocks.append(Printed([*written, f"report: {out / 'report.html'}"]))
-    first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
-    return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
+    return Document(result.target_design.name, " ".join(first), [Section("", blocks, terminal=True)], answers)
 
 
 def _remarks(result: RunResult) -> Iterator[str]:

@@ -49,8 +49,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 Value = TypeVar("Value")
-Rows = Literal["faces", "circles", "images", "observations"]
-"""Tables of :meth:`RunResult.to_dataframe`."""
+Rows = Literal["faces", "circles", "images", "observations"]  # tables of :meth:`RunResult.to_dataframe`
 COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
 OF_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
 
@@ -197,8 +196,7 @@ def target_in(faces: FacesFile) -> CalibratedTarget:
     return CalibratedTarget(faces.reference_face, faces.poses(), circles, {}, *covariances, {}, scale_sigma, whole)
 
 
-AnyRun = SavedRun | str | Path
-"""A finished run: its folder, or what ``load_run`` or ``run`` returned."""
+AnyRun = SavedRun | str | Path  # its folder, or what ``load_run`` or ``run`` returned
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
@@ -304,11 +302,13 @@ class RunResult(SavedRun):
 
     def unadjusted(self) -> dict[str, frozenset[Label]]:
         """Returns the labels of the keypoints that are not in the result, by image."""
-        residuals, left = self.residuals_px(), {}
-        for image in self.observations:
-            without = np.isnan(residuals[image.name]).any(axis=1)
-            left[image.name] = frozenset(image.labels[i] for i in np.flatnonzero(without).tolist())
-        return left
+        residuals = self.residuals_px()
+        return {
+            image.name: frozenset(
+                image.labels[i] for i in np.flatnonzero(np.isnan(residuals[image.name]).any(1)).tolist()
+            )
+            for image in self.observations
+        }
 
     def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
         """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).

@@ -3,11 +3,11 @@ group, each of which is cached by its inputs."""
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import numpy as np
@@ -51,12 +51,9 @@ from stcal.sfm.runs.run_options import RunOptions, is_vague, require_dots
 from stcal.sfm.runs.transaction import RunFolder
 
 CACHE_VERSION = 8
-LEAST_WITHOUT, MOST_WITHOUT = 3, 40
-"""Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
-UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)
-"""Errors by which one group has no solution, while others may."""
-LIKELY = "; the likely cause: "
-"""How the part of an error begins that says what the photographs that cannot be solved have in common."""
+LEAST_WITHOUT, MOST_WITHOUT = 3, 40  # images of a group above and up to which one that contradicts is looked for
+UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)  # a group has no solution, others may
+LIKELY = "; the likely cause: "  # then what the photographs that cannot be solved have in common
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 S = TypeVar("S")
 
@@ -288,12 +285,9 @@ def start_of(model: CameraModel, sized: Camera, options: RunOptions) -> Camera:
 
 def map_groups(task: Task, groups: Groups, names: Collection[str] = ()) -> Groups:
     """Maps and refines the groups, or some: by the mapper, or by faces of known shape, which place the whole body."""
+    solve = _solve_body if faces_of_known_shape(groups.board) and not groups.board_alone else _solve_groups
     with groups.naming_cause():
-        if faces_of_known_shape(groups.board) and not groups.board_alone:
-            solutions, unsolved = _solve_body(task, groups)
-        else:
-            folders = task.folder.stage / "scratch", task.folder.cache
-            solutions, unsolved = solve_groups(groups, task.target, *folders, task.progress, names or groups.names)
+        solutions, unsolved = solve(task, groups, names or groups.names)
     return replace(groups, solutions=tuple(solutions.values()), unsolved=tuple(unsolved))
 
 
@@ -380,36 +374,30 @@ class _Group:
         return hasher.hexdigest()[:40]
 
 
-def solve_groups(
-    groups: Groups, target: TargetDesign, scratch: Path, cache: Path, progress: Progress, names: Collection[str] = ()
-) -> tuple[dict[str, GroupSolution], list[str]]:
-    """Maps and refines group by group, all if no ``names`` are given; returns the solutions, and the reasons why groups
-    have none; raises the error of the first group if there is no solution. ``scratch`` is made and removed again,
-    ``cache`` keeps what later runs take up."""
-    images, options = groups.observations, groups.options
+def _solve_groups(task: Task, groups: Groups, names: Collection[str]) -> tuple[dict[str, GroupSolution], list[str]]:
+    """Maps and refines group by group, or takes up what an earlier run has kept; returns solutions, and notes on
+    others."""
+    images, options, graph = groups.observations, groups.options, groups.graph
     inputs = {}
     for name, of_group in by_group(images).items():
-        if not names or name in names:
+        if name in names:
             within = np.array([image.group == name for image in images])
-            pairs = (np.cumsum(within) - 1)[groups.graph.pairs[within[groups.graph.pairs].all(1)]]
-            skeleton = [images[i].name for i in groups.graph.skeleton[name]]
-            how = groups.camera, target, groups.board, options.pairs, options.eccentricity
+            pairs = (np.cumsum(within) - 1)[graph.pairs[within[graph.pairs].all(1)]]
+            skeleton = [images[i].name for i in graph.skeleton[name]]
+            how = groups.camera, task.target, groups.board, options.pairs, options.eccentricity
             inputs[name] = _Group(of_group, skeleton, pairs, *how)
-    paths = {name: cache / f"group-{group.key()}.npz" for name, group in inputs.items()}
+    paths = {name: task.folder.cache / f"group-{group.key()}.npz" for name, group in inputs.items()}
     found: dict[str, GroupSolution | StcalError | None] = {name: kept(path, _stored) for name, path in paths.items()}
     pending = [name for name, solution in found.items() if solution is None]
-    step = counted(progress, "map", len(inputs))
+    step = counted(task.progress, "map", len(inputs))
     for _ in range(len(inputs) - len(pending)):
         step(None)
-    scratch.mkdir()
-    try:
-        jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
+    with TemporaryDirectory(prefix="", dir=task.folder.stage, ignore_cleanup_errors=True) as scratch:
+        jobs = [(inputs[name], Path(scratch) / str(k)) for k, name in enumerate(pending)]
         for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[name] = solution
             if isinstance(solution, GroupSolution):
                 _save(paths[name], solution)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
 
     def with_scale(name: str) -> GroupSolution:
         solution = found[name]
@@ -466,7 +454,7 @@ def _stored(stored, meta) -> GroupSolution:
     return GroupSolution(model=WorldModel(group, tuple(images), poses, parse_labels(labels), **arrays), **plain)
 
 
-def _solve_body(task: Task, groups: Groups) -> tuple[dict[str, GroupSolution], list[str]]:
+def _solve_body(task: Task, groups: Groups, _: Collection[str]) -> tuple[dict[str, GroupSolution], list[str]]:
     """Places the body by its faces, and maps and refines its groups; returns solutions, and notes on others."""
     camera, board, eccentricity = groups.camera, groups.board, groups.options.eccentricity
     circles = [face for face in task.target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]

@@ -48,13 +48,10 @@ class MarkerFile(ResultFile):
         return self.model_copy(update={"sha256": {files.RUN_MARKER: files.own_digest(content), **others}})
 
 
-STAGE, READY = f"{files.INTERNAL}/unfinished", f"{files.INTERNAL}/ready"
-"""Results that are being written, and results that are complete."""
+STAGE, READY = f"{files.INTERNAL}/unfinished", f"{files.INTERNAL}/ready"  # results in the making, and complete
 GONE = "gone.txt"  # names of the earlier results that complete ones lack
-RESULTS = tuple(name for name in files.RUN_ENTRIES if name != files.INTERNAL)
-"""Entries that new results replace, or remove if the new results lack them."""
-LOOKED_AT = ("detections.csv", "overlays", "report.html")
-"""Results of a run that fails which help to see why, and claim nothing."""
+RESULTS = tuple(name for name in files.RUN_ENTRIES if name != files.INTERNAL)  # are replaced, or removed
+LOOKED_AT = ("detections.csv", "overlays", "report.html")  # help to see why a run failed
 LONGEST_DATABASE, MOST_DATABASE_BYTES = f"{STAGE}/scratch/mapping.db.partial-journal", 500
 """Longest path of a database below a run's folder, and the longest that SQLite takes (512, of which it keeps a few)."""
 

@@ -20,6 +20,7 @@ from stcal.sfm.make import (
     NAMES,
     DesignOptions,
     faces_of,
+    make_pattern,
     make_target,
     sides_of,
     size_of,
@@ -38,23 +39,17 @@ def made():
 
 
 @pytest.mark.slow
-def test_each_face_is_named_with_any_three_circles_hidden(made):
-    """All cases: by the finder in made views, which the maker has run, and by the naming alone."""
+def test_each_face_is_named_with_any_three_circles_hidden_and_no_four_are_alike_in_two_readings(made):
+    """All cases, by the finder in made views, which the maker has run, and by the naming alone. Nor are they alike with
+    another face, turned, or in a mirror: by the package's own search for likeness."""
     target = made.target
     assert made.cases == 5 * 84
-    for face in target.faces:
-        for gone in combinations(range(len(face.ids)), HIDDEN):
-            assert is_named(face, set(range(len(face.ids))) - set(gone), target)
-
-
-@pytest.mark.slow
-def test_no_four_circles_are_alike_in_two_readings(made):
-    """Not with another face, not turned, not in a mirror: by the package's own search for likeness."""
-    target = made.target
     assert made.likeness < MIN_COMMON
     assert not any(confusable(face, target) for face in target.faces)
     assert mirror_images(target) == {}
     for face in target.faces:
+        for gone in combinations(range(len(face.ids)), HIDDEN):
+            assert is_named(face, set(range(len(face.ids))) - set(gone), target)
         for other in target.faces:
             assert in_common(face, other, mirrored=True) == 0
 
@@ -103,10 +98,10 @@ def test_circles_are_seen_well_and_keep_apart(made):
         assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
 
 
-def test_faces_lie_on_the_box(made):
+def test_faces_lie_on_the_box():
     """Plates' corners are corners of the box, shared by three faces but for those below; normals point outwards."""
     corners = []
-    for face in made.target.faces:
+    for face in make_pattern(sides_of(SIZE), LEAST_CIRCLES, 4.0, "dark", 0, "box")[0].faces:
         assert face.rough_target_from_face is not None
         assert face.outline_mm is not None
         place = face.rough_target_from_face @ np.pad(face.outline_mm, ((0, 0), (0, 1)))

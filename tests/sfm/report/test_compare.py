@@ -1,7 +1,7 @@
 """What ``compare`` and ``measure`` take of a ``faces.json``: no other format, no other unit, no matrix that is none."""
 
 import json
-import shutil
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.report.compare import compare, compare_poses, comparison_table, poses_table
 from stcal.synthetic.dataset import TruthFile
 from tests.outcome import fails_with
-from tests.shared import own_copy, unsealed_copy
 
 COVARIANCE = "target_from_face_covariance"
 
@@ -54,27 +53,34 @@ def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, f
     assert (worst > 1000) == (factor != 1.0)
 
 
-def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_path):
-    run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
-    assert compare(run, small_dataset / "truth.json").labels is not None
-    (run / "labels.csv").write_text("image,label\n12/IMG_1000.jpg,1:a\n")
-    with pytest.warns(InputNote, match="labels.csv: damaged: the labels are not compared"):
-        assert compare(run, small_dataset / "truth.json").labels is None
-    (run / "labels.csv").unlink()
-    with pytest.warns(InputNote, match="labels.csv: No such file or directory: the labels are not compared"):
-        compare(run, small_dataset / "truth.json")
-
-
-def test_images_without_labels_are_counted(small_run, small_dataset, tmp_path):
-    run = unsealed_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
-    known = compare(run, small_dataset / "truth.json")
-    head, *rows = (run / "labels.csv").read_text().splitlines(keepends=True)
-    lost = rows[0].split(",")[2]
-    (run / "labels.csv").write_text("".join([head, *(row for row in rows if row.split(",")[2] != lost)]))
-    found = compare(run, small_dataset / "truth.json")
-    assert (found.labels.images, found.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
-    assert f"in the {found.labels.images} of {known.labels.images} images that have labels" in comparison_table(found)
+def test_labels_are_counted_rightly_and_it_is_said_where_they_cannot_be(small_run, small_dataset, tmp_path):
+    for name in ("faces.json", "labels.csv"):
+        (tmp_path / name).write_bytes((small_run / name).read_bytes())
+    labels, truth = tmp_path / "labels.csv", small_dataset / "truth.json"
+    known, (head, *rows) = compare(tmp_path, truth), labels.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    assert known.labels.wrong == 0
     assert "images that have labels" not in comparison_table(known)
+
+    def found(*lines: str):
+        labels.write_text("\n".join([head, *lines]))
+        return compare(tmp_path, truth)
+
+    a_column_less = [row for row, cell in zip(rows, cells, strict=True) if not re.fullmatch("board:.*:8", cell[4])]
+    assert len(a_column_less) < len(rows)
+    assert found(*a_column_less).labels.wrong == 0
+    lost = cells[0][2]
+    assert found(*rows, f"1,99,{lost},12,board:7:0,5,5").labels.wrong == 1  # off the board
+    without = found(*(row for row, cell in zip(rows, cells, strict=True) if cell[2] != lost))
+    assert (without.labels.images, without.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
+    said = f"in the {without.labels.images} of {known.labels.images} images that have labels"
+    assert said in comparison_table(without)
+    labels.write_text("image,label\n12/IMG_1000.jpg,1:a\n")
+    with pytest.warns(InputNote, match="labels.csv: damaged: the labels are not compared"):
+        assert compare(tmp_path, truth).labels is None
+    labels.unlink()
+    with pytest.warns(InputNote, match="labels.csv: No such file or directory: the labels are not compared"):
+        compare(tmp_path, truth)
 
 
 def test_a_place_beyond_all_reach_is_named(small_run, small_dataset, tmp_path):

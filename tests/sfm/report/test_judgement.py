@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import MappingError
 from stcal.sfm.data.group_model import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
-from stcal.sfm.report.judgement import judgement_of, with_judgement
+from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.report.run_page import report_html
 from stcal.sfm.runs.report_file import Remark
 from tests.sfm.report.test_report import make
@@ -247,8 +247,8 @@ def test_a_group_that_was_left_out_calls_for_care_and_says_why():
 
 def test_after_no_there_are_no_micrometres_but_what_does_not_hold():
     for key in (key for key, (_, invalid) in CHECKS.items() if invalid):
-        failed = with_judgement(report(check(key, "failed", remedy="x"), check("b", "passed"), f3=[3.04, 1.0, 1.0]))
-        told = failed["judgement"]
+        failed = report(check(key, "failed", remedy="x"), check("b", "passed"), f3=[3.04, 1.0, 1.0])
+        told = judgement_of(failed).model_dump()
         assert told["invalid"] == list(CHECKS[key][1])
         assert all(what in told["quality"] for what in told["invalid"])
         assert "µm" not in told["quality"]

@@ -31,10 +31,6 @@ def assert_success(outcome) -> str:
     return out
 
 
-def results_in(out: Path) -> list[str]:
-    return [name for name in RESULTS if (out / name).exists()]
-
-
 def detections(out: Path) -> dict[tuple[str, str], tuple[float, float]]:
     """(image, label) → centre, px, of a run or of a detection alone."""
     table = next(out / name for name in ("labels.csv", "detections.csv") if (out / name).exists())
@@ -85,6 +81,7 @@ def test_no_image_is_left(small_set, stcal_sfm):
 
 @pytest.mark.usefixtures("no_page")
 def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm):
+    """Each photograph once, in whatever form and however often it lies in the folder; and one that shows no circle."""
     small = small_set("12")
     good = pixels(small.image())
     folder = small.images / "12"
@@ -97,7 +94,8 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
         "small.jpg": (encoded(".jpg", good[:-1]), "1296×863 px, but the camera file says 1296×864 px"),
         "float.tif": (encoded(".tif", good.astype(np.float32)), "pixels of type float32; 8 or 16 bit needed"),
         "notes.txt": (b"f/8, ISO 100", "not an image file"),
-        "copy.jpg": (small.image(2).read_bytes(), "the same image as 12/IMG_1002.jpg"),
+        "IMG_1002 (copy).jpg": (small.image(2).read_bytes(), "the same image as 12/IMG_1002.jpg"),
+        "Copy of IMG_1003.jpg": (small.image(3).read_bytes(), "the same image as 12/IMG_1003.jpg"),
     }
     # Damage that decoders do not report: bytes in the middle are gone, the picture comes out shifted.
     data = bytearray(small.image(1).read_bytes())
@@ -111,7 +109,9 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
     (folder / "more.jpg").mkdir()
     bad |= {"link.jpg": (b"", "broken link"), "more.jpg": (b"", "a folder inside a group")}
-    # "copy.jpg" sorts after the capitals, so the original is the one that is used.
+    (folder / "IMG_1001.png").write_bytes(encoded(".png", pixels(small.image(1))))
+    bad["IMG_1001.jpg"] = (b"", "the same image as 12/IMG_1001.png, saved in another form")
+    (folder / "black.png").write_bytes(encoded(".png", np.zeros_like(good)))
     out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     report = (small.out / "report.json").read_text(encoding="utf-8")
     for name, (_, reason) in bad.items():
@@ -120,74 +120,32 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
         assert f"12/{name}" in report
     assert sum(line.startswith("skipped ") for line in out.splitlines()) == len(bad)
     assert json.loads(report)["summary"]["images_mapped"] == 4
-    assert {image for image, _ in detections(small.out)} == {f"12/IMG_{1000 + i}.jpg" for i in range(4)}
+    assert {image for image, _ in detections(small.out)} == {
+        f"12/IMG_100{end}" for end in ("0.jpg", "1.png", "2.jpg", "3.jpg")
+    }
+    ((name, reason),) = ((each["name"], each["reason"]) for each in json.loads(report)["left_out"]["images"])
+    assert (name, "0 of its circles or corners are in the model, 6 needed" in reason) == ("12/black.png", True)
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_name_that_is_not_utf8_is_left_out(small_set, stcal_sfm):
-    small = small_set("12")
-    for name in (b"caf\xe9.jpg", b"two\nlines.jpg"):
-        try:
-            Path(os.fsdecode(os.fsencode(small.images / "12") + b"/" + name)).write_bytes(small.image().read_bytes())
-        except OSError:
-            pytest.skip("this file system takes UTF-8 only")
-    arguments = ("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
-    out = assert_success(stcal_sfm(*arguments))
-    assert re.search(r"^skipped 12/caf\S+\.jpg: its name is not UTF-8; rename it$", out, re.M)
-    assert re.search(r"^skipped 12/two\S+\.jpg: its name holds a control character; rename it$", out, re.M)
-
-
-def assert_left_out(small, stcal_sfm, *parts: str) -> None:
-    """The run goes on without group 14, says why, and does not claim its face."""
+def test_a_group_without_the_board_and_a_photograph_in_two_groups(small_set, small_scene, stcal_sfm):
+    """The run goes on without group 14, says why, and does not claim its face; the photograph is in neither group."""
+    small = small_set("12", "14")
+    blacken(small, small_scene, "14", board=True, count=2)
+    shutil.copy(small.image(3, "12"), small.images / "14" / "IMG_0999.jpg")
     out = assert_success(stcal_sfm(*small.arguments(*CHAIN, "--no-strict")))
+    for name in ("12/IMG_1003.jpg", "14/IMG_0999.jpg"):
+        said = f"skipped {name}: the same photograph is in groups 12 and 14, and belongs to one"
+        assert said in " ".join(out.split())
     assert re.search(r"May I use it\? (No|Part, with care): .*group\s+14\s+was\s+left\s+out\s+completely", out, re.S)
     notes = json.loads((small.out / "report.json").read_text())["notes"]
     (note,) = (note["note"] for note in notes if (note["code"], note["place"]) == (GROUP_LEFT_OUT, "14"))
-    assert all(part in note for part in parts)
+    parts = ("group 14: no board recognised in 2 images", "keep the whole board in view", "board.toml")
+    assert [part for part in parts if part not in note] == []
     assert "left out whole: group 14" in out
     faces = json.loads((small.out / "faces.json").read_text())["target_from_face"].keys()
     assert {"1", "2"} <= faces
     assert "4" not in faces
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_photograph_in_two_groups_is_in_none(small_set, stcal_sfm):
-    small = small_set("12", "14")
-    shutil.copy(small.image(3, "12"), small.images / "14" / "IMG_0999.jpg")
-    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
-    for name in ("12/IMG_1003.jpg", "14/IMG_0999.jpg"):
-        said = f"skipped {name}: the same photograph is in groups 12 and 14, and belongs to one"
-        assert said in " ".join(out.split())
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_group_without_the_board(small_set, small_scene, stcal_sfm):
-    small = small_set("12", "14")
-    blacken(small, small_scene, "14", board=True, count=2)
-    parts = ("group 14: no board recognised in 2 images", "keep the whole board in view", "board.toml")
-    assert_left_out(small, stcal_sfm, *parts)
-
-
-@pytest.mark.usefixtures("no_page")
-def test_two_of_them_in_view(small_set, small_scene, stcal_sfm):
-    """A picture of the target lies in one image's corner: neither is read, and the real one is measured where the group
-    predicts it."""
-    small = small_set("12")
-    picture = pixels(small.image()).copy()
-    rows, columns = box_around(small_scene, "12", 0, board=False)
-    copied = picture[rows, columns]
-    height, width = copied.shape
-    picture[-height - 20 : -20, 20 : 20 + width] = copied
-    small.image().write_bytes(encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, 95))
-    code, _, _ = stcal_sfm(*small.arguments(*CHAIN))
-    assert code == 0
-    report = json.loads((small.out / "report.json").read_text())
-    notes = [each["note"] for each in report["left_out"]["notes"] if each["image"] == "12/IMG_1000.jpg"]
-    assert any(note.startswith("face 1 found more than once") for note in notes)
-    code, _, _ = stcal_sfm("compare", small.out, small.folder / "truth.json")
-    labels = json.loads((small.out / "compare.json").read_text())["labels"]
-    assert (code, labels["wrong"]) == (0, 0)
-    assert labels["found"] >= 0.97 * labels["visible"]  # the copy may cover some
 
 
 @pytest.mark.parametrize("kind", ["target", "board"])
@@ -267,7 +225,7 @@ def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, mon
     assert line.startswith("interrupted; finished detections are kept, run the same command again")
     assert {p.name for p in small.out.iterdir()} == {".stcal"}
     assert_success(stcal_sfm(*small.arguments(*CHAIN)))
-    assert results_in(small.out) == list(RESULTS)
+    assert [name for name in RESULTS if not (small.out / name).exists()] == []
     assert len(detected) == 3  # the first one was kept
 
 
@@ -288,31 +246,54 @@ def test_formats_of_the_same_pixels(small_set):
         np.testing.assert_array_equal(pixels(path), grey)
 
 
-def test_a_format_of_more_bits(small_set, small_run, stcal_sfm):
+def test_a_format_of_more_bits_and_names_that_are_not_utf8(small_set, small_run, stcal_sfm):
     """16 bit are scaled so that the bright end just fits, edges are found at other grey levels."""
     small = small_set("12")
     for i in (1, 2, 3):
         small.image(i).unlink()
+    for name in (b"caf\xe9.jpg", b"two\nlines.jpg"):
+        try:
+            Path(os.fsdecode(os.fsencode(small.images / "12") + b"/" + name)).write_bytes(small.image().read_bytes())
+        except OSError:
+            pytest.skip("this file system takes UTF-8 only")
     small.image().write_bytes(encoded(".tif", pixels(small.image()).astype(np.uint16) * 257))
     arguments = ("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
-    assert_success(stcal_sfm(*arguments))
+    out = assert_success(stcal_sfm(*arguments))
+    assert re.search(r"^skipped 12/caf\S+\.jpg: its name is not UTF-8; rename it$", out, re.M)
+    assert re.search(r"^skipped 12/two\S+\.jpg: its name holds a control character; rename it$", out, re.M)
     expected = {key: xy for key, xy in detections(small_run).items() if key[0] == "12/IMG_1000.jpg"}
     same_centres(detections(small.out), expected, 0.02)
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
+def test_a_camera_of_opencv_without_a_size_and_two_targets_in_view(small_set, small_run, small_scene, stcal_sfm):
+    """A picture of the target lies in one image's corner: neither is read, and the real one is measured where the group
+    predicts it."""
     small = small_set("12")
     camera = read_camera(small.camera)
     path = small.folder / "camera.yml"
     text = opencv_yaml(camera.focal[0], *camera.centre, camera.distortion[:5].tolist())
     path.write_text(text, encoding="utf-8")
     small.image(3).write_bytes(encoded(".jpg", pixels(small.image(3))[:-100]))
+    picture = pixels(small.image()).copy()
+    copied = picture[box_around(small_scene, "12", 0, board=False)]
+    height, width = copied.shape
+    picture[-height - 20 : -20, 20 : 20 + width] = copied
+    small.image().write_bytes(encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, 95))
     out = assert_success(stcal_sfm(*small.arguments("--camera", path, *CHAIN)))
     assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the majority of the images says 1296×864 px" in out
-    expected = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("12/IMG_1000")}
-    found = {key: xy for key, xy in detections(small.out).items() if key[0].startswith("12/IMG_1000")}
+    found, expected = (
+        {key: xy for key, xy in detections(run).items() if key[0].startswith("12/IMG_1001")}
+        for run in (small.out, small_run)
+    )
     same_centres(found, expected, 1e-5)
+    report = json.loads((small.out / "report.json").read_text())
+    notes = [each["note"] for each in report["left_out"]["notes"] if each["image"] == "12/IMG_1000.jpg"]
+    assert any(note.startswith("face 1 found more than once") for note in notes)
+    code, _, _ = stcal_sfm("compare", small.out, small.folder / "truth.json")
+    labels = json.loads((small.out / "compare.json").read_text())["labels"]
+    assert (code, labels["wrong"]) == (0, 0)
+    assert labels["found"] >= 0.97 * labels["visible"]  # the copy may cover some
 
 
 @pytest.mark.slow

@@ -1,7 +1,4 @@
-"""One photograph is one view, however often and in whatever form it lies in the folder."""
-
-import json
-import shutil
+"""One photograph is one view, in whatever form it lies in the folder; of a run: `test_bad_input.py`."""
 
 import cv2
 import numpy as np
@@ -10,10 +7,8 @@ import pytest
 from stcal.io.images import ImageFile, same_photograph
 from stcal.sfm.detect.candidates import ImageDetection
 from stcal.sfm.detect.detect_files import DetectedImage, _without_copies
-from tests.conftest import SMALL
 from tests.sfm.detect.test_arrangement import centres_of
 
-pytestmark = pytest.mark.usefixtures("no_page")
 NOISE = 2.5
 """Grey values: 1 % of full scale."""
 
@@ -51,21 +46,6 @@ def test_sixteen_bits_and_a_picture_without_noise_are_the_same_photograph(sharp)
     assert same_photograph(smooth, as_jpeg(smooth, 90))
     assert not same_photograph(smooth, smooth[:-1])
     assert not same_photograph(smooth, np.roll(smooth, 1, axis=1))
-
-
-@pytest.mark.slow
-def test_png_and_jpeg_of_one_photograph_are_one_view(stcal_sfm, small_set):
-    small = small_set("12")
-    cv2.imwrite(str(small.image(1).with_suffix(".png")), cv2.imread(str(small.image(1)), cv2.IMREAD_GRAYSCALE))
-    shutil.copy(small.image(2), small.image(2).with_name("IMG_1002 (copy).jpg"))
-    shutil.copy(small.image(3), small.image(3).with_name("Copy of IMG_1003.jpg"))
-    files = "--target", small.folder / "target.toml", "--board", small.folder / "board.toml"
-    code, out, _ = stcal_sfm(*small.arguments(*files, "--solve", "chain"))
-    assert code == 0
-    assert json.loads((small.out / "report.json").read_text())["summary"]["images_mapped"] == SMALL.images_per_group
-    assert "skipped 12/IMG_1001.jpg: the same image as 12/IMG_1001.png, saved in another form" in out
-    assert "skipped 12/IMG_1002 (copy).jpg: the same image as 12/IMG_1002.jpg" in out
-    assert "skipped 12/Copy of IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", None])

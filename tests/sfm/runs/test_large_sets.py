@@ -24,7 +24,8 @@ from stcal.sfm.mapping.pairs import (
     track_parts,
 )
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.stages import Groups, solve_groups
+from stcal.sfm.runs.stages import Groups, Task, map_groups
+from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.scripts import script_path
 
@@ -46,13 +47,14 @@ def crowd(labels_only):
 def solve(scene, observations, kind, out):
     options = RunOptions().settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
-    (out / ".stcal/cache").mkdir(parents=True)
+    out.mkdir()
     labelled = tuple(LabelledImage(image, ()) for image in observations)
-    groups = Groups(labelled, (), graph, scene.camera, scene.board, options, False, ())
-    solved, _ = solve_groups(groups, scene.target, out / "scratch", out / ".stcal/cache", lambda *_: None)
-    models = [solution.model for solution in solved.values()]
+    groups = Groups(labelled, tuple(scene.groups), graph, scene.camera, scene.board, options, False, ())
+    task = Task(([], []), RunFolder(out, out, out), scene.target, scene.board, options, lambda *_: None)
+    solutions = map_groups(task, groups).solutions
+    models = [solution.model for solution in solutions]
     calibration = calibrate(models, scene.camera, scene.target, scene.board, options.adjustment(scene.target))
-    return list(solved.values()), calibration
+    return solutions, calibration
 
 
 def require_same_tracks(scene, images) -> None:

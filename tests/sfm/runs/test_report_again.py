@@ -17,30 +17,27 @@ from tests.outcome import INPUT, assert_error
 
 
 @pytest.mark.slow
-def test_the_same_files_make_the_same_page(own_run, small_run, stcal_sfm, monkeypatch):
+def test_the_same_files_make_the_same_page_there_or_in_a_file_of_ones_own(
+    own_run, small_run, tmp_path, stcal_sfm, monkeypatch
+):
     monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
     (own_run / "report.html").write_text("spoilt")
     assert verify(own_run).notes()
+    before, page = (own_run / RUN_MARKER).read_bytes(), (small_run / "report.html").read_bytes()
+    own = tmp_path / "for the lab"
+    code, out, _ = stcal_sfm("report", own_run, "--pdf", "--out", f"{own}.html")
+    assert (code, out) == (0, f"report: {own}.html\nreport: {own}.pdf\n")
+    assert (own.with_suffix(".html").read_bytes(), own.with_suffix(".pdf").read_bytes()) == (page, b"<!DOCTYPE html>")
+    assert ((own_run / RUN_MARKER).read_bytes(), (own_run / "report.pdf").exists()) == (before, False)
     code, out, _ = stcal_sfm("report", own_run, "--pdf")
     assert (code, out) == (0, f"report: {own_run}/report.html\nreport: {own_run}/report.pdf\n")
-    assert (own_run / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
+    assert (own_run / "report.html").read_bytes() == page
     assert (own_run / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
     assert verify(own_run).notes() == []
     with added_results(own_run) as stage:
         (stage / "report.html").write_text("another")
     assert not (own_run / "report.pdf").exists()  # it was made of the page before
     assert verify(own_run).notes() == []
-
-
-def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm, monkeypatch):
-    monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
-    before = (own_run / RUN_MARKER).read_bytes()
-    code, out, _ = stcal_sfm("report", own_run, "--pdf", "--out", tmp_path / "for the lab.html")
-    assert (code, out) == (0, f"report: {tmp_path}/for the lab.html\nreport: {tmp_path}/for the lab.pdf\n")
-    assert (tmp_path / "for the lab.html").read_bytes() == (own_run / "report.html").read_bytes()
-    assert (tmp_path / "for the lab.pdf").read_bytes().startswith(b"%PDF")
-    assert (own_run / RUN_MARKER).read_bytes() == before
-    assert not (own_run / "report.pdf").exists()
 
 
 def test_what_cannot_be_made_is_said_in_one_line(own_run, tmp_path, stcal_sfm):

@@ -6,15 +6,15 @@ import re
 import shutil
 from dataclasses import asdict
 from importlib import import_module
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from stcal.design import reference_target
-from stcal.errors import InputError
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
-from stcal.sfm import run, uncertainty_budget
+from stcal.sfm import run
 from stcal.sfm.adjust.faces_file import read_target
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
@@ -86,12 +86,6 @@ def test_labels_and_centres_are_the_same_numbers(written):
     assert saved.observations[1].centre_px.shape == saved.corrected_px[1].shape == (0, 2)
 
 
-def test_a_run_just_made_gives_what_its_folder_gives(small_result, small_run):
-    made, read = (uncertainty_budget(each).file.content() for each in (small_result, small_run))
-    assert made == read
-    assert set(made["faces"]) == {"2", "4", "5"}
-
-
 def test_camera_designs_options_and_faces_are_the_same(written):
     result, saved = written
     assert saved.camera.same_as(result.camera)
@@ -150,77 +144,19 @@ def test_an_expected_face_that_the_design_lacks():
     refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, reference_target())
 
 
-def edit(path, change) -> None:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    change(content)
-    path.write_text(json.dumps(content), encoding="utf-8")
+def edited(change):
+    """A change of the content of a JSON file."""
+
+    def apply(path) -> None:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        change(content)
+        path.write_text(json.dumps(content), encoding="utf-8")
+
+    return apply
 
 
-NEEDED = [CAMERA, TARGET, BOARD, "labels.csv", DATABASE, "report.json", "faces.json"]
-
-
-@pytest.mark.parametrize("name", NEEDED)
-def test_a_file_is_missing(own_run, name):
-    (own_run / name).unlink()
-    code = "E-RUN-NO-FACES" if name == "faces.json" else "E-RUN-UNFINISHED"
-    refuses(f"{code} … {own_run} … {name}", load_run, own_run)
-
-
-def test_not_a_run(own_run, tmp_path, stcal_sfm):
-    (own_run / ".stcal/run.json").unlink()
-    for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
-        outcome = stcal_sfm("faces", own_run / "colmap/models", "--run", path)
-        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", ".stcal/run.json", "--out")
-
-
-def test_a_folder_of_detections_only(small_set, stcal_sfm):
-    small = small_set("12")
-    stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
-    outcome = stcal_sfm("faces", small.out, "--run", small.out)
-    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), f"{CAMERA}, {TARGET}")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "code"),
-    [
-        (".stcal/run.json", b"[1]", "CONTENT"),
-        ("report.json", b"\xff\xfe", "INVALID"),
-        ("faces.json", b"[" * 100_000, "INVALID"),
-    ],
-)
-def test_a_file_that_is_no_json_object(own_run, name, content, code):
-    (own_run / name).write_bytes(content)
-    refuses(f"E-JSON-{code} … {own_run / name} … run it again", load_run, own_run)
-
-
-WRONG = {
-    "of before images were written": (".stcal/run.json", lambda c: c.pop("images"), "no 'images'"),
-    "of before circles were written": ("faces.json", lambda c: c.pop("circles"), "no 'circles'"),
-    "options null, as of detect": (".stcal/run.json", lambda c: c.update(options=None), "no 'pairs'"),
-    "an option unknown here": (".stcal/run.json", lambda c: c["options"].update(magic=1), "magic"),
-    "no such face": (".stcal/run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
-    "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "images.1: 'a': "),
-    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "index out of range"),
-    "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
-    "another group's pair": (
-        "report.json",
-        lambda c: c["groups"][0].update(pairs=c["groups"][1]["pairs"]),
-        "group 12: its initial pair is not of its images",
-    ),
-    "the residual a word": ("report.json", lambda c: c["summary"].update(residual_rms_px="small"), "'small'"),
-    "names that are none": (
-        ".stcal/run.json",
-        lambda c: c["options"].update(exclude=[7]),
-        "options: exclude <1>: a tuple, each a text, needed",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_value_that_no_run_writes(own_run, case):
-    name, change, part = WRONG[case]
-    edit(own_run / name, change)
-    refuses(f"E-RUN-DAMAGED … {own_run / name}: damaged, or of another version … {part}", load_run, own_run)
+def holding(content: bytes):
+    return lambda path: path.write_bytes(content)
 
 
 def rows(change):
@@ -240,6 +176,39 @@ def value(row: int, column: int, text: str):
     return rows(lambda body: [*body[:row], [*body[row][:column], text, *body[row][column + 1 :]], *body[row + 1 :]])
 
 
+def nudge(path) -> None:
+    """Another digit, in the largest place after a point."""
+    text = path.read_text(encoding="utf-8")
+    place = max(match.start() for match in re.finditer(r"(?<=\d\.\d)\d", text))
+    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")
+
+
+DAMAGED = "E-RUN-DAMAGED … FILE: damaged, or of another version"
+WRONG = {
+    "of before images were written": (".stcal/run.json", edited(lambda c: c.pop("images")), "no 'images'"),
+    "of before circles were written": ("faces.json", edited(lambda c: c.pop("circles")), "no 'circles'"),
+    "options null, as of detect": (".stcal/run.json", edited(lambda c: c.update(options=None)), "no 'pairs'"),
+    "an option unknown here": (".stcal/run.json", edited(lambda c: c["options"].update(magic=1)), "magic"),
+    "no such face": (".stcal/run.json", edited(lambda c: c["options"].update(reference_face="9")), "no face 9"),
+    "report's images a list of names": (
+        "report.json",
+        edited(lambda c: c.update(images=["a", "b"])),
+        "images.1: 'a': ",
+    ),
+    "a group without pairs": ("report.json", edited(lambda c: c["groups"][0].update(pairs=[])), "index out of range"),
+    "a group missing": ("report.json", edited(lambda c: c["groups"].pop()), "no '14'"),
+    "another group's pair": (
+        "report.json",
+        edited(lambda c: c["groups"][0].update(pairs=c["groups"][1]["pairs"])),
+        "group 12: its initial pair is not of its images",
+    ),
+    "the residual a word": ("report.json", edited(lambda c: c["summary"].update(residual_rms_px="small")), "'small'"),
+    "names that are none": (
+        ".stcal/run.json",
+        edited(lambda c: c["options"].update(exclude=[7])),
+        "options: exclude <1>: a tuple, each a text, needed",
+    ),
+}
 ORDER = "image 12/IMG_1000.jpg: its keypoints are not 0 to 8"
 LABELS = {
     "two rows swapped": (rows(lambda body: [body[1], body[0], *body[2:]]), ORDER),
@@ -255,27 +224,47 @@ LABELS = {
     "no such column": (lambda path: path.write_text(path.read_text().replace("var_x_px2", "s", 1)), "no 'var_x_px2'"),
     "one endless field": (lambda path: path.write_text('image\n"' + 200_000 * "x"), "field larger than"),
 }
+NEEDED = [CAMERA, TARGET, BOARD, "labels.csv", DATABASE, "report.json"]
+SPOILT = {
+    **{case: (name, spoil, f"{DAMAGED} … {part}") for case, (name, spoil, part) in WRONG.items()},
+    **{case: ("labels.csv", spoil, f"{DAMAGED} ( … {part}") for case, (spoil, part) in LABELS.items()},
+    **{f"no {name}": (name, Path.unlink, f"E-RUN-UNFINISHED … RUN … {name}") for name in NEEDED},
+    "no faces.json": ("faces.json", Path.unlink, "E-RUN-NO-FACES … RUN … faces.json"),
+    "a list": (".stcal/run.json", holding(b"[1]"), "E-JSON-CONTENT … FILE … run it again"),
+    "not UTF-8, of JSON": ("report.json", holding(b"\xff\xfe"), "E-JSON-INVALID … FILE … run it again"),
+    "endlessly nested": ("faces.json", holding(b"[" * 100_000), "E-JSON-INVALID … FILE … run it again"),
+    "a lens cut": (CAMERA, holding(b"1 PINHOLE 9 9 1 1 1"), "E-CAMERA-COEFFICIENTS … FILE … 3 … 4"),
+    "a polarity that is none": (TARGET, holding(b"polarity = 3"), "E-KEY-VALUE … FILE … polarity"),
+    "no TOML": (BOARD, holding(b"rows"), "E-TOML-INVALID … FILE"),
+    **{
+        f"another digit in {name}": (name, nudge, "E-RUN-CHANGED … FILE … run it again")
+        for name in ("labels.csv", "faces.json", "report.json", CAMERA, TARGET, ".stcal/run.json")
+    },
+}
+"""The file that is spoiled, how, and the error, in which RUN is the folder and FILE the file."""
 
 
-@pytest.mark.parametrize("case", LABELS)
-def test_labels_that_are_not_the_database_s(own_run, case):
-    spoil, part = LABELS[case]
-    spoil(own_run / "labels.csv")
-    refuses(f"E-RUN-DAMAGED … {own_run / 'labels.csv'}: damaged, or of another version ( … {part}", load_run, own_run)
+@pytest.mark.parametrize("case", SPOILT)
+def test_a_folder_that_is_not_as_the_run_wrote_it_is_refused(own_run, case):
+    name, spoil, error = SPOILT[case]
+    spoil(own_run / name)
+    refuses(error.replace("RUN …", f"{own_run} …").replace("FILE", str(own_run / name)), load_run, own_run)
+    if case == "another digit in faces.json":  # also by what reads it alone
+        refuses("E-RUN-CHANGED", read_target, own_run / name, own_run / TARGET)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "part"),
-    [
-        (CAMERA, "1 PINHOLE 9 9 1 1 1", "3 parameters of PINHOLE, 4 needed"),
-        (TARGET, "polarity = 3", "polarity"),
-        (BOARD, "rows", "not valid TOML"),
-    ],
-)
-def test_a_damaged_copy_of_what_the_run_was_given(own_run, name, content, part):
-    (own_run / name).write_text(content, encoding="utf-8")
-    with pytest.raises(InputError, match=f"file {own_run / name}: .*{part}"):
-        load_run(own_run)
+def test_not_a_run(own_run, tmp_path, stcal_sfm):
+    (own_run / ".stcal/run.json").unlink()
+    for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
+        outcome = stcal_sfm("faces", own_run / "colmap/models", "--run", path)
+        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", ".stcal/run.json", "--out")
+
+
+def test_a_folder_of_detections_only(small_set, stcal_sfm):
+    small = small_set("12")
+    stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    outcome = stcal_sfm("faces", small.out, "--run", small.out)
+    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), f"{CAMERA}, {TARGET}")
 
 
 def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
@@ -285,20 +274,6 @@ def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
     found, known = load_run(run), load_run(small_run)
     assert [image.labels for image in found.observations] == [image.labels for image in known.observations]
     assert all(np.array_equal(a, b) for a, b in zip(found.corrected_px, known.corrected_px, strict=True))
-
-
-def nudge(path):
-    text = path.read_text(encoding="utf-8")
-    place = max(match.start() for match in re.finditer(r"(?<=\d\.\d)\d", text))
-    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")
-
-
-@pytest.mark.parametrize("name", ["labels.csv", "faces.json", "report.json", CAMERA, TARGET, ".stcal/run.json"])
-def test_a_file_with_another_digit_is_refused(own_run, name):
-    nudge(own_run / name)
-    refuses(f"E-RUN-CHANGED … {own_run / name} … run it again", load_run, own_run)
-    if name == "faces.json":  # also what reads it alone
-        refuses("E-RUN-CHANGED", read_target, own_run / name, own_run / TARGET)
 
 
 def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_path):
