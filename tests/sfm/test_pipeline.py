@@ -1,6 +1,5 @@
 """The whole chain on simulated photographs: what the run's folder holds, and that any COLMAP can use it."""
 
-import csv
 import json
 import re
 from dataclasses import replace
@@ -25,15 +24,10 @@ def test_a_result_shows_itself_in_a_line_and_in_a_notebook(small_result):
     assert re.findall(r'<th scope="row" class="l">(\d)', page) == list(small_result.target.target_from_face)
 
 
-def test_every_promised_file_is_there_and_agrees(small_result):
-    result, out = small_result, small_result.out
-    faces = json.loads((out / "faces.json").read_text())
-    for face_id, pose in result.target.target_from_face.items():
-        np.testing.assert_array_equal(faces["target_from_face"][face_id], pose.matrix())
-    np.testing.assert_allclose(faces["circles"]["1:1"], 0, atol=0.01)
-    with open(out / "labels.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == sum(len(o) for o in result.observations)
+def test_every_promised_file_is_there(small_run):
+    """Faces and labels are read back in `runs/test_saved_run.py`."""
+    out = small_run
+    np.testing.assert_allclose(json.loads((out / "faces.json").read_text())["circles"]["1:1"], 0, atol=0.01)
     report = json.loads((out / "report.json").read_text())
     assert report["summary"]["images_mapped"] == 8
     assert len(report["groups"][0]["pairs"]) == 6
