@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from stcal import robot as arms
 from stcal.cli import options as shared
 from stcal.cli.help import group
 from stcal.cli.options import WRITES, Arg, Opt
@@ -14,8 +15,7 @@ from stcal.errors import DegenerateError, InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from stcal.robot.kinematics.measurements import Measurements
-    from stcal.robot.kinematics.robot_model import Chain, Robot
+    from stcal.robot.kinematics.robot_model import Chain
 
 
 XML = (".urdf", ".xml")
@@ -43,8 +43,7 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
-    from stcal.robot.descriptions import coupled, load_urdf, read_universal, require_urdf_written, robot_urdf
-    from stcal.robot.kinematics.robot_file import load_robot
+    from stcal.robot.descriptions import coupled, read_universal, require_urdf_written
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
@@ -64,7 +63,7 @@ def convert(
         both = "URDF" if to_xml else "robot files"
         raise InputError("E-OPTION-FILES", f"{source}, {out}: both are {both}; one of each needed")
     elif from_xml:
-        urdf = load_urdf(source, from_link, to_link or "", convention)
+        urdf = arms.load_urdf(source, from_link, to_link or "", convention)
         robot, way = urdf.robot, f"{urdf.from_link} to {urdf.to_link}: {', '.join(urdf.joints)}"
         comment = f"From {source.name}, {way}."
         say(f"robot {robot.name}: {len(urdf.joints)} joints from {way}")
@@ -77,26 +76,26 @@ def convert(
     else:
         if convention != "standard":
             raise InputError("E-OPTION-NEEDS", "--convention: only for reading a URDF; leave it out")
-        robot, comment = load_robot(source), ""
+        robot, comment = arms.load_robot(source), ""
         tools = f"{len(robot.tools)} tools"
-        ends = f"flange, and {tools}" if robot.tree is None else f"{tools} on branches"
+        ends = f"{tools} on branches" if robot.tree else f"flange, and {tools}"
         say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
         if coupled(robot):
             meant = "its joint values are the coupling times the controller's, with wider limits"
             say(f"note: URDF has no coupling; {meant}")
     if to_xml:
-        write(out, robot_urdf(robot))
+        write(out, arms.robot_urdf(robot))
         require_urdf_written(out, robot)
     else:
         _write_robot(out, robot, comment)
 
 
-def _write_robot(path: Path | None, robot: "Robot", *comments: str, chain: "Chain | None" = None) -> None:
+def _write_robot(path: Path | None, robot: "arms.Robot", *comments: str, chain: "Chain | None" = None) -> None:
     """Writes a robot file, and reads it again, if a path is given."""
-    from stcal.robot.kinematics.robot_file import require_robot_written, robot_toml
+    from stcal.robot.kinematics.robot_file import require_robot_written
 
     if path is not None:
-        write(path, robot_toml(robot, comments))
+        write(path, arms.robot_toml(robot, comments))
         require_robot_written(path, robot, chain)
 
 
@@ -141,16 +140,16 @@ def axes(
     report: shared.ReportFile = None,
 ) -> None:
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
-    from stcal.robot import load_robot, read_measurements, robot_from_sweeps
     from stcal.robot.axes.axes_model import AxesFile
     from stcal.robot.axes.fit import ring
     from stcal.robot.robot_report import axes_report
 
-    nominal = load_robot(robot_file)
+    nominal = arms.load_robot(robot_file)
     source = joined.table(sweeps, "SWEEPS")
-    data = read_measurements(source, nominal, rotation=rotation)
+    data = arms.read_measurements(source, nominal, rotation=rotation)
     length_mm = _length(orientations, data)
-    result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
+    places = None if length_mm is None else ring(length_mm)
+    result = arms.robot_from_sweeps(data, nominal, math.radians(still_deg), places)
     document = axes_report(result, data.where)
     say(document.text())
     if length_mm is not None:
@@ -163,7 +162,7 @@ def axes(
     write_if(report, document.page)
 
 
-def _length(text: str, data: "Measurements") -> float | None:
+def _length(text: str, data: "arms.Measurements") -> float | None:
     """Returns the distance of virtual reflectors, mm; None for positions alone."""
     from stcal.robot.axes.fit import length_of
 
@@ -222,26 +221,24 @@ def identify(
     report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
-    from stcal.robot import IdentifyOptions, load_robot, offsets_csv, read_measurements, robot_toml
-    from stcal.robot import identify as identified_from
     from stcal.robot.identification.prior import adjusted
     from stcal.robot.identification.result import IdentifiedFile, require_identified_written
     from stcal.robot.identified_report import identified_report
 
-    nominal = load_robot(robot_file)
+    nominal = arms.load_robot(robot_file)
     source = joined.table(data_file, "DATA", quaternions=quaternions)
-    data = read_measurements(source, nominal, quaternions, rotation, payload_kg)
-    options = IdentifyOptions(
+    data = arms.read_measurements(source, nominal, quaternions, rotation, payload_kg)
+    options = arms.IdentifyOptions(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
-    result = identified_from(nominal, data, options)
+    result = arms.identify(nominal, data, options)
     document = identified_report(result)
     say(document.text())
     if out:
         comment = f"Identified from {shared.name_of(source)}: {result.rank} parameters."
-        write(out, robot_toml(result.robot, [comment]))
+        write(out, arms.robot_toml(result.robot, [comment]))
         require_identified_written(out, result)
-    _write_table(offsets, lambda: offsets_csv(result, nominal))
+    _write_table(offsets, lambda: arms.offsets_csv(result, nominal))
     write_if(json_file, lambda: IdentifiedFile.model_validate(result))
     write_if(report, document.page)
 
@@ -263,20 +260,18 @@ def evaluate(
     report: shared.ReportFile = None,
 ) -> None:
     """Compare robot files on new measurements, and tell what their residuals depend on."""
-    from stcal.robot import evaluate as evaluated
-    from stcal.robot import load_robot, read_measurements
-    from stcal.robot import robot_report as shown
+    from stcal.robot.robot_report import evaluation_report, names_of
     from stcal.robot.use.evaluation import EvaluationFile
 
-    robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
+    robots = dict(zip(names_of(robot_files), map(arms.load_robot, robot_files), strict=True))
     source = joined.table(data_file, "DATA", quaternions=quaternions)
-    read = partial(read_measurements, source, quaternions=quaternions, payload_kg=payload_kg)
+    read = partial(arms.read_measurements, source, quaternions=quaternions, payload_kg=payload_kg)
     data = [read(robot) for robot in robots.values()]  # within reach of each
-    result = evaluated(robots, data[0], refit)
-    document = shown.evaluation_report(result)
+    result = arms.evaluate(robots, data[0], refit)
+    document = evaluation_report(result)
     say(document.text())
     print_each("note", data[0].notes)
-    _write_table(out, lambda: shown.evaluated_csv(result))
+    _write_table(out, lambda: arms.evaluated_csv(result))
     write_if(json_file, lambda: EvaluationFile.model_validate(result))
     write_if(report, document.page)
 
@@ -299,12 +294,12 @@ def verify(
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
     from stcal.robot.robot_report import verification_figure, verification_report
-    from stcal.robot.use import evaluation
+    from stcal.robot.use.evaluation import VerificationFile
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
         tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
-    result = evaluation.verify(evaluation.read_measured(tables))
+    result = arms.verify(arms.read_measured(tables))
     document = verification_report(result)
     say(document.text())
     print_each("note", result.notes)
@@ -314,7 +309,7 @@ def verify(
 
         save(verification_figure(result), plot)
         say(f"written: {plot}")
-    write_if(json_file, lambda: evaluation.VerificationFile.model_validate(result))
+    write_if(json_file, lambda: VerificationFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -333,20 +328,19 @@ def compensate(
     report: shared.ReportFile = None,
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
-    from stcal.robot import load_robot, read_targets
     from stcal.robot.robot_report import compensation_report
-    from stcal.robot.use import compensation
+    from stcal.robot.use.compensation import CompensationFile
 
-    identified = load_robot(robot_file)
+    identified = arms.load_robot(robot_file)
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
-    wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
-    result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
+    wanted = arms.read_targets(source, identified, quaternions, rotation, payload_kg)
+    result = arms.compensate(identified, wanted, arms.load_robot(nominal) if nominal else None)
     document = compensation_report(result)
     say(document.text())
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
-    _write_table(out, lambda: compensation.compensated_csv(result, identified))
-    write_if(json_file, lambda: compensation.CompensationFile.model_validate(result))
+    _write_table(out, lambda: arms.compensated_csv(result, identified))
+    write_if(json_file, lambda: CompensationFile.model_validate(result))
     write_if(report, document.page)
     if not result.found.usable.any():
         raise DegenerateError("E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see above")
@@ -367,20 +361,19 @@ def design(
     report: shared.ReportFile = None,
 ) -> None:
     """Choose the measurement poses that determine the robot's parameters best."""
-    from stcal.robot.kinematics.robot_file import load_robot
     from stcal.robot.robot_report import design_report
-    from stcal.robot.use import pose_design as pose_design
+    from stcal.robot.use.pose_design import DesignFile
 
     inside = _box(box) if box else None
-    options = pose_design.DesignOptions(count, seed, observe, candidates, sigma_mm, sigma_rad, inside, target)
-    robot = load_robot(robot_file)
-    result = pose_design.design(robot, options)
+    options = arms.DesignOptions(count, seed, observe, candidates, sigma_mm, sigma_rad, inside, target)
+    robot = arms.load_robot(robot_file)
+    result = arms.design(robot, options)
     document = design_report(result, robot)
     say(document.text())
     also = f" and {sigma_rad:g} rad" if observe == "pose" else ""
     say(f"for an instrument whose {observe}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
-    _write_table(out, lambda: pose_design.design_csv(result, robot))
-    write_if(json_file, lambda: pose_design.DesignFile.model_validate(result))
+    _write_table(out, lambda: arms.design_csv(result, robot))
+    write_if(json_file, lambda: DesignFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -418,7 +411,6 @@ def from_photos(
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.files import require_new_folder, save_folder
-    from stcal.robot import IdentifyOptions, load_robot
     from stcal.sfm import MeasureOptions, read_target
     from stcal.workflows.from_photos import files_of, require_files_written, robot_from_photos, story
 
@@ -426,8 +418,8 @@ def from_photos(
     design = target_of(target, printed=False)
     with StageProgress() as progress:
         seen = images, read_camera(camera), read_target(faces, design), design
-        arm, dots = load_robot(robot_file), load_dots(board) if board else None
-        how = MeasureOptions(workers=workers), IdentifyOptions(model=model, partial=partial)
+        arm, dots = arms.load_robot(robot_file), load_dots(board) if board else None
+        how = MeasureOptions(workers=workers), arms.IdentifyOptions(model=model, partial=partial)
         result = robot_from_photos(*seen, joints, arm, targets, dots, key, *how, progress)
     print_each("note", result.notes)
     for line in story(result):

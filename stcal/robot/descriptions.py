@@ -180,9 +180,9 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
         most = UNLIMITED * each.unit
         joints.append(Joint(kind, low if low > -most else -np.inf, high if high < most else np.inf))
     sliding = np.array([joint.type == "prismatic" for joint in joints])
-    ends, tree = (*(Rigid(),) * (n - 1), flange), None if "" in paths else Tree(mounts, carriers)
+    ends, tree = (*(Rigid(),) * (n - 1), flange), Tree() if "" in paths else Tree(mounts, carriers)
     chain = Chain(placed.rotation, placed.translation, ends, sliding, np.eye(n), None, tree)
-    if tree is None:
+    if not tree:
         tools = {tool: flange.inverse() @ pose for tool, pose in tools.items()}
         robot = robot_between(chain, tools, name, convention, tuple(joints))
     else:
@@ -356,11 +356,11 @@ def robot_urdf(robot: Robot) -> str:
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
             shown = {end: repr(float(value)) for end, value in ends.items()}
             ElementTree.SubElement(element, "limit", shown | {"effort": "0", "velocity": "0"})
-    if robot.tree is None:
+    if not robot.tree:
         fix(f"link_{len(chain)}", FLANGE, chain.ends[-1])
     for name, tool in robot.tools.items():
         carrier = chain.carrier(name)
-        at = (FLANGE, tool) if robot.tree is None else (f"link_{carrier + 1}", chain.ends[carrier] @ tool)
+        at = (f"link_{carrier + 1}", chain.ends[carrier] @ tool) if robot.tree else (FLANGE, tool)
         fix(at[0], link_of(name), at[1])
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
@@ -380,7 +380,7 @@ def require_urdf_written(path: str | Path, robot: Robot) -> None:
 
     def again() -> np.ndarray:
         kinematic = q @ robot.coupling.T
-        if robot.tree is None:
+        if not robot.tree:
             found = load_urdf(path, convention=robot.convention).robot
             chain = found.chain()
             return tips(lambda name: flange_poses(chain, kinematic) @ found.tool(name))
@@ -388,7 +388,7 @@ def require_urdf_written(path: str | Path, robot: Robot) -> None:
         order = [int(name.removeprefix("joint_")) - 1 for name in read.joints]
         return tips(lambda name: read.robot.world_from_base @ forward(read.robot, kinematic[:, order], link_of(name)))
 
-    base = robot.world_from_base if robot.tree is None else Rigid()  # a tree is read from its base
+    base = Rigid() if robot.tree else robot.world_from_base  # a tree is read from its base
     wanted = tips(lambda name: base @ forward(robot, q, name))
     far = max(SAME_MM, 1e-12 * float(np.abs(wanted).max()))
     require_written(path, again, wanted, far, "mm")

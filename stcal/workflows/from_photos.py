@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal import robot as arms
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.arrays import require_arguments, rms
@@ -27,21 +28,6 @@ from stcal.parallel import Progress, scratch_folder
 from stcal.report.document import Document, Section, bullets, links, listed
 from stcal.report.document import Table as ShownTable
 from stcal.report.text import number
-from stcal.robot import (
-    Identified,
-    IdentifyOptions,
-    Measurements,
-    Robot,
-    Targets,
-    compensate,
-    compensated_csv,
-    evaluate,
-    identify,
-    read_measurements,
-    read_targets,
-    robot_from_sweeps,
-    robot_toml,
-)
 from stcal.robot.axes.axes_model import AxesFile, AxesResult
 from stcal.robot.axes.fit import find_arcs, length_of, ring
 from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
@@ -76,11 +62,11 @@ class FromPhotos:
 
     images: str
     measured: MeasureResult
-    nominal: Robot
-    data: Measurements
+    nominal: arms.Robot
+    data: arms.Measurements
     axes: AxesResult | None
     without_axes: str
-    identified: Identified
+    identified: arms.Identified
     compensated: Compensated | None
     errors: dict[str, Figures]
     notes: tuple[str, ...]
@@ -188,15 +174,18 @@ def _steps(result: FromPhotos) -> dict[str, tuple]:
     check, page = pose_report.require_table_written, partial(pose_report.measure_report, measured, result.images)
     steps: dict[str, tuple] = {"poses": ("csv", table, partial(check, result=measured), content, page)}
     if axes is not None:
-        text = robot_toml(axes.robot, ["Identified by the axis method from the sweeps."])
+        text = arms.robot_toml(axes.robot, ["Identified by the axis method from the sweeps."])
         again = partial(require_robot_written, robot=axes.robot, chain=axes.chain)
         page = partial(axes_report, axes, result.data.where)
         steps["axes"] = "toml", text, again, AxesFile.model_validate(axes), page
-    text, again = robot_toml(identified.robot, [source]), partial(require_identified_written, result=identified)
+    text, again = arms.robot_toml(identified.robot, [source]), partial(require_identified_written, result=identified)
     page = partial(identified_report, identified)
     steps["identified"] = "toml", text, again, IdentifiedFile.model_validate(identified), page
     if compensated is not None:
-        text, content = compensated_csv(compensated, identified.robot), CompensationFile.model_validate(compensated)
+        text, content = (
+            arms.compensated_csv(compensated, identified.robot),
+            CompensationFile.model_validate(compensated),
+        )
         again, page = partial(require_text_written, text=text), partial(compensation_report, compensated)
         steps["compensated"] = "csv", text, again, content, page
     return steps
@@ -227,12 +216,12 @@ def robot_from_photos(
     target: TargetCircles,
     design: TargetDesign,
     joints: str | Path,
-    nominal: Robot,
+    nominal: arms.Robot,
     targets: str | Path | Table | None = None,
     board: BoardDesign | None = None,
     key: str = "image",
     measure_options: MeasureOptions | None = None,
-    options: IdentifyOptions | None = None,
+    options: arms.IdentifyOptions | None = None,
     progress: Progress | None = None,
 ) -> FromPhotos:
     """Measures the target in photographs, identifies the arm that carried it, and compensates targets.
@@ -262,12 +251,12 @@ def robot_from_photos(
     # Both are read before the work, as both may be refused.
     values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)
     carried = dict.fromkeys(targets_of(values), Rigid())
-    wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
+    wanted = None if targets is None else arms.read_targets(targets, replace(nominal, tools=carried))
     measured = measure(images, camera_model(camera), target, design, board, measure_options, progress)
     return from_measured(str(images), measured, values, nominal, wanted, options)
 
 
-def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
+def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: arms.Robot) -> Table:
     """Returns joint values with each row's photograph as ``image``, which replaces ``key``. Raises InputError: no such
     column, rows of no photograph or of one twice, poses beside them, or other joints than the robot's."""
     values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
@@ -282,9 +271,9 @@ def from_measured(
     images: str,
     measured: MeasureResult,
     values: Table,
-    nominal: Robot,
-    wanted: Targets | None = None,
-    options: IdentifyOptions | None = None,
+    nominal: arms.Robot,
+    wanted: arms.Targets | None = None,
+    options: arms.IdentifyOptions | None = None,
 ) -> FromPhotos:
     """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
     :func:`robot_from_photos`."""
@@ -292,12 +281,12 @@ def from_measured(
         written = folder / "poses.csv"
         save(written, pose_report.poses_csv(measured)[0])
         joined = join_tables(replace(read_table(written, "poses"), where=PHOTOGRAPHS), values, pose_report.IMAGE)
-    data = read_measurements(joined.table, nominal)
+    data = arms.read_measurements(joined.table, nominal)
     axes, without = _axes(data, nominal)
-    identified = identify(nominal, data, options)
-    compensated = None if wanted is None else compensate(identified.robot, wanted, nominal)
+    identified = arms.identify(nominal, data, options)
+    compensated = None if wanted is None else arms.compensate(identified.robot, wanted, nominal)
     models = {DRAWING: nominal} if axes is None else {DRAWING: nominal, AXES: axes.robot}
-    evaluation = evaluate(models, data)
+    evaluation = arms.evaluate(models, data)
     good = ~evaluation.wrong
     errors = {each.name: each.good_mm for each in evaluation.robots}
     errors[SAME_ROWS] = Figures.of(identified.fitted_mm[good])
@@ -308,12 +297,12 @@ def from_measured(
     return FromPhotos(images, measured, nominal, *results, joined.notes + tuple(data.notes))
 
 
-def _axes(data: Measurements, nominal: Robot) -> tuple[AxesResult | None, str]:
+def _axes(data: arms.Measurements, nominal: arms.Robot) -> tuple[AxesResult | None, str]:
     """Returns the axis method's result from the rows that sweep one joint each, or the reason why there is none."""
     try:
         arcs, _ = find_arcs(data, nominal)
         rows = np.unique(np.concatenate([arc.rows for arc in arcs]))
         length_mm = length_of(data)
-        return robot_from_sweeps(data[rows], nominal, places=None if length_mm is None else ring(length_mm)), ""
+        return arms.robot_from_sweeps(data[rows], nominal, places=None if length_mm is None else ring(length_mm)), ""
     except StcalError as error:  # the workflow can do without this step
         return None, str(error).removeprefix(f"{data.where}: ")

@@ -21,7 +21,7 @@ from stcal.register.registration import Liu2017Options
 from stcal.register.registration_report import error_table, matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
-from stcal.robot.identification.adjustment import State
+from stcal.robot.identification.adjustment import State, position_errors
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_conditions, targets_of
@@ -135,16 +135,16 @@ def register_with_robot(
         weights, covariances = (None if each is None else each[train] for each in (pairs.weights, pairs.covariances))
         of_train = {"weights": weights, "covariances": covariances, "folds": 0, "allow_ambiguous": True}
         b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **of_train).b_from_a
-        return np.linalg.norm(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test], axis=1)
+        return position_errors(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test])
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
         fitted = grown(robot, data[train], good[train], settings)[0].robot
-        return np.linalg.norm(pairs.xyz_b[test] - positions(fitted, data[test]), axis=1)
+        return position_errors(pairs.xyz_b[test] - positions(fitted, data[test]))
 
     parts = dealt(len(data), folds, np.random.default_rng([found.seed, 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
     nominal = positions(robot, data)
-    off_mm = rms(np.linalg.norm(pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal, axis=1))
+    off_mm = rms(position_errors(pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal))
     wild = ~(found.inliers | used)[rows]
     return RegisteredRobot(robot, identified, found.model, pairs.lines, done, rows, by_one, by_both, wild, off_mm)
 

@@ -14,7 +14,6 @@ from stcal.io.images import Skipped
 from stcal.io.table import POSE, Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import made
 from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
@@ -23,6 +22,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows import from_photos as work
 from stcal.workflows.from_photos import FromPhotos, files_of, story
 from tests.outcome import refuses
+from tests.support.arms import targets
 from tests.support.image_poses import known_target, see
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
@@ -77,10 +77,6 @@ def joint_table(q, names=None) -> Table:
     return Table("log.csv", {"image": names} | dict(zip(JOINTS, np.degrees(q).T, strict=True)), range(2, len(q) + 2))
 
 
-def wanted(q) -> Targets:
-    return Targets("targets.csv", range(2, len(q) + 2), ("",) * len(q), None, q)
-
-
 @pytest.fixture(scope="module")
 def cell():
     return Cell()
@@ -91,10 +87,10 @@ def swept(cell):
     """Sweeps and 30 other poses; the last has no joint values, and one row of the log no photograph."""
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
-    targets, options = wanted(cell.about(12)), IdentifyOptions(folds=2, repeats=1)
+    wanted, options = targets(None, cell.about(12)), IdentifyOptions(folds=2, repeats=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)  # of rows left out the result knows by their influence
-        return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), targets, options)
+        return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted, options)
 
 
 @pytest.mark.slow

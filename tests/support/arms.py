@@ -1,12 +1,13 @@
 """Simulated arms that bend or that branch."""
 
+from collections.abc import Sequence
 from dataclasses import astuple, replace
 
 import numpy as np
 
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
-from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.measurements import Measurements, Targets
 from stcal.robot.kinematics.robot_model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
@@ -34,6 +35,12 @@ def seen_arm(rng: np.random.Generator, rows: int, share: float = 0.6) -> tuple[R
     """An arm as made, and what an instrument sees over the middle ``share`` of its ranges."""
     true = placed(made(mh80(), rng), WORLD, {"": TOOL})
     return true, measured(true, joint_vectors(true, rows, rng, share), rng)
+
+
+def targets(poses: Poses | None, q: np.ndarray | None = None, tools: Sequence[str] = ()) -> Targets:
+    """Poses base_from_tool (m,), or joint values (m, n) that command them, as the rows of a file after its header."""
+    m = len(q) if poses is None else len(poses)
+    return Targets("targets t.csv", range(2, m + 2), tuple(tools) or ("",) * m, poses, q)
 
 
 def two_arms(convention: Convention = "standard") -> Robot:

@@ -189,7 +189,7 @@ def robot_from_sweeps(
     if len(set(data.stations)) > 1:
         fault = f"{data.where}: stations {', '.join(data.by_station())}"
         raise InputError("E-STATION-SINGLE", f"{fault}; sweeps are seen from one, so give one at a time")
-    if nominal.tree is not None:
+    if nominal.tree:
         remedy = "the axis method takes one arm at a time: give its file"
         raise InputError("E-ROBOT-TREE", f"robot {nominal.name} is a tree of joints; {remedy}")
     measured, virtual = data, None if places is None else virtual_reflectors(data, places)

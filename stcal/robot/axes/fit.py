@@ -133,13 +133,10 @@ class VirtualReflectors:
     def tools(self, places: dict[str, Rigid], spread_mm: dict[str, float]) -> tuple[dict[str, Rigid], dict[str, float]]:
         """Returns the poses of the targets from their reflectors' places, and the RMS about these places."""
         tools, spread = {}, {}
-        for name in dict.fromkeys(self.data.targets):
-            target, _, number = name.rpartition(SEPARATOR)
-            if number == "1":
-                names = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
-                xyz = np.array([places[each].translation for each in names])
-                tools[target] = align_rigid(xyz, self.places)
-                spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in names])))
+        for target in dict.fromkeys(name.rpartition(SEPARATOR)[0] for name in self.data.targets):
+            names = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
+            tools[target] = align_rigid(np.array([places[each].translation for each in names]), self.places)
+            spread[target] = rms(np.array([spread_mm[each] for each in names]))
         return tools, spread
 
 

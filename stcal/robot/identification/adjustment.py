@@ -117,7 +117,7 @@ class State:
         """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by parameters, rad over mm."""
         tip = self.tips(q, targets, conditions)
         axes_part = chain_jacobian(self.chain, q, tip, conditions)
-        if self.chain.tree is not None:
+        if self.chain.tree:
             joint = [i for i, _ in self.chain.parameters()]
             axes_part = axes_part * self.chain.carries(targets)[joint].T[:, None]
         parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in self.tools)]

@@ -263,8 +263,7 @@ def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
         reach = i - 1 if nominal.convention == "standard" else i
         row = nominal.rows[reach]
         parallel = abs(np.cos(row.alpha) * np.cos(row.beta)) > np.cos(PARALLEL_RAD)
-        follows = nominal.tree is None or i not in nominal.tree.mounts
-        if follows and parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
+        if i not in nominal.tree.mounts and parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
             pairs.append((i - 1, reach))
     return tuple(pairs)
 
@@ -288,7 +287,7 @@ def placed(
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)
         stations = [station.inverse() for station in list(at.stations.values())[1:]]
-        mounts = [] if robot.tree is None else [pose for _, pose in robot.tree.mounts.values()]
+        mounts = (pose for _, pose in robot.tree.mounts.values())
         return Poses.of([robot.world_from_base, *robot.tools.values(), *stations, *mounts])
 
     def slope(step: np.ndarray) -> np.ndarray:
@@ -304,9 +303,8 @@ def placed(
         sigma[0] = np.nan
     tools = (f"tool {name}".rstrip() for name in state.tools)
     names = ["base", *tools, *(f"station {name}" for name in list(state.stations)[1:])]
-    if nominal.tree is not None:
-        names += [
-            f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
-            for i, (after, _) in nominal.tree.mounts.items()
-        ]
+    names += [
+        f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
+        for i, (after, _) in nominal.tree.mounts.items()
+    ]
     return tuple(PlacedFrame(*each) for each in zip(names, poses(state), sigma, strict=True))

@@ -59,7 +59,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         return _with_stations(robot, data, fit)
     named = sorted(set(data.targets))
     _require_motion(data, named)
-    carriers = named if robot.tree is None else robot.tree.carriers
+    carriers = robot.tree.carriers if robot.tree else named
     for name in (name for name in named if name not in carriers):
         target = f"target {name}" if name else "the tool of rows without a target"
         remedy = "give it a [[target]] with joint" if name else "give [tool] joint"
@@ -259,7 +259,7 @@ def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple
 
 def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
     """Yields the rows before instrument, base or target moved, if the rows between moves all fit by themselves."""
-    if data.positions is None or robot.tree is not None:
+    if data.positions is None or robot.tree:
         return
     starts, far_mm = [0], FITS * _extent(data)
     while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
@@ -343,7 +343,7 @@ def _of_order(robot: Robot, data: Measurements) -> Iterator[Case]:
             order = [{i: k, k: i}.get(r, r) for r in range(n)]
             what = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
             yield what, robot, replace(data, q=q[:, order])
-            if robot.tree is None:
+            if not robot.tree:
                 what = f"rows {i + 1} and {k + 1} were exchanged; correct the robot file"
                 yield what, replace(robot, rows=tuple(robot.rows[r] for r in order)), data
     if sliding.all() or not sliding.any():

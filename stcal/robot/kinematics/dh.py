@@ -39,7 +39,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     n = len(chain)
     rows = list(nominal.rows)
     standard = nominal.convention == "standard"
-    mounts = {} if nominal.tree is None else nominal.tree.mounts
+    mounts = nominal.tree.mounts
     begins = {0, *mounts}
     first = dict.fromkeys(begins, Rigid())
     passed = [Rigid()] * n  # free motion of a joint: about its axis and along it (if prismatic, any slide)
@@ -70,10 +70,9 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
         return nominal_end.inverse() @ passed[i]
 
-    base, tree = begin(0), nominal.tree
-    if tree is not None:
-        before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
-        tree = replace(tree, mounts={i: (after, before[i] @ begin(i)) for i, (after, _) in mounts.items()})
+    base = begin(0)
+    before = {i: end(after) if after >= 0 else base.inverse() for i, (after, _) in mounts.items()}
+    tree = replace(nominal.tree, mounts={i: (after, before[i] @ begin(i)) for i, (after, _) in mounts.items()})
     on_flange = {name: end(k := chain.carrier(name)) @ chain.ends[k] @ tool for name, tool in tools.items()}
     robot = replace(nominal, rows=tuple(rows), world_from_base=base, tools=on_flange, elasticity=None, tree=tree)
     if chain.elasticity is None:
@@ -164,18 +163,17 @@ def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robo
 
 def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
     """Returns the row without β that gives this pose, or None; only its d and θ unless ``across_too``."""
+    if modified and across_too:  # the way back along a standard row
+        back = _row_of(pose.inverse(), modified=False, across_too=True)
+        return None if back is None else DHRow(-back.a, -back.alpha, -back.d, -back.theta)
     r, p = pose.rotation, pose.translation
     if not across_too:
         row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))
-    elif modified:
-        alpha = float(np.arctan2(-r[1, 2], r[2, 2]))
-        d = float(r[1, 2] * p[1] + r[2, 2] * p[2])
-        row = DHRow(float(p[0]), alpha, d, float(np.arctan2(-r[0, 1], r[0, 0])))
     else:
         theta = float(np.arctan2(r[1, 0], r[0, 0]))
         a = float(np.cos(theta) * p[0] + np.sin(theta) * p[1])
         row = DHRow(a, float(np.arctan2(r[2, 1], r[2, 2])), float(p[2]), theta)
-    pose_of_row = across(row) @ along(row) if modified else along(row) @ across(row)
+    pose_of_row = along(row) @ across(row)
     fits = np.abs(pose_of_row.rotation - r).max() < ROUNDING and np.abs(pose_of_row.translation - p).max() < ROUNDING_MM
     return row if fits else None
 

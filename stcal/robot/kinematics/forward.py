@@ -120,7 +120,7 @@ def torques(
     carried = chain.gathered((rotation @ elasticity.moment[:, None, :, None])[:, :, :, 0])
     mass = np.full(len(q), elasticity.payload_kg) if conditions.payload_kg is None else conditions.payload_kg
     if mass.any():
-        if "" not in chain.order.carriers:
+        if chain.tree and "" not in chain.tree.carriers:
             fault = "the robot is a tree of joints, and its file does not say which carries the load"
             raise InputError("E-ROBOT-TREE", f"{fault}; give [tool] joint")
         last = chain.carrier("")
@@ -191,7 +191,7 @@ def _walk(
             axes = np.stack([x, y, axes[2]])
         if give is not None:
             axes = np.einsum("kjm,mkc->cjm", axes, give[i])
-        if chain.tree is not None:
+        if chain.tree:
             moved[i] = axes, origin
     return axes, origin
 
@@ -226,7 +226,7 @@ def elasticity_jacobian(
     gives = across * np.eye(3) + (axis - across) * z[..., :, None] * z[..., None, :]  # (n, m, 3, 3)
     gives = np.concatenate([gives, -skew(lever) @ gives], axis=2)
     moves = chain.carries(targets)[:, :, None]
-    moved = chain.passed(np.where(moves[..., None], gives, 0.0))
+    moved = np.tensordot(chain.behind().T, np.where(moves[..., None], gives, 0.0), 1)  # with the joints before each
     pulled = _by_moment(chain, rotation, elasticity)
     by_moment = np.moveaxis(moved @ pulled, 3, 1).reshape(-1, len(q), 6)
     turned = np.concatenate([np.stack([about, torque - about], axis=1), np.moveaxis(periodic, 0, 1)], axis=1)

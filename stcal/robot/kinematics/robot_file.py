@@ -139,8 +139,8 @@ def load_robot(path: str | Path) -> Robot:
     return Robot(data.name, data.convention, *arm, base, tools, elasticity, _tree(data, where), data.unusual_size)
 
 
-def _tree(data: _RobotFile, where: str) -> Tree | None:
-    """Returns the tree that keys ``after``, ``mount`` and ``joint`` describe; None without such keys."""
+def _tree(data: _RobotFile, where: str) -> Tree:
+    """Returns the tree that keys ``after``, ``mount`` and ``joint`` describe."""
     mounts, carriers, n = {}, {}, len(data.joint)
 
     def refuse(wrong: bool, said: str) -> None:
@@ -160,7 +160,7 @@ def _tree(data: _RobotFile, where: str) -> Tree | None:
             what = f"target {name}" if name else "tool"
             refuse(not 1 <= each.joint <= n, f"{what}: joint is {each.joint}, 1 … {n} needed")
             carriers[name] = each.joint - 1
-    return Tree(mounts, carriers) if mounts or carriers else None
+    return Tree(mounts, carriers)
 
 
 def _joint(j: _JointFile, where: str) -> Joint:
@@ -203,7 +203,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     if (robot.coupling != np.eye(len(robot.rows))).any():
         lines.append("# kinematic joint values from the controller's")
         add("coupling", robot.coupling)
-    tree = robot.tree or Tree({}, {})
+    tree = robot.tree
     for i, (row, joint) in enumerate(zip(robot.rows, robot.joints, strict=True)):
         lines += ["", "[[joint]]", f'type = "{joint.type}"']
         for name, key in _KEYS.items():

@@ -228,7 +228,7 @@ class Elasticity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tree:
-    """Which joint carries which, of a robot with several arms on one trunk.
+    """Which joint carries which, of a robot with several arms on one trunk; of a serial arm empty, and False.
 
     ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where its
     first row begins at the end of the carrier's row, mm; every other joint is carried by the one before it.
@@ -236,8 +236,8 @@ class Tree:
     branch that is carried by a joint that does not come before it.
     """
 
-    mounts: Mapping[int, tuple[int, Rigid]]
-    carriers: Mapping[str, int]
+    mounts: Mapping[int, tuple[int, Rigid]] = field(default_factory=dict)
+    carriers: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
         for joint, (after, _) in self.mounts.items():
@@ -245,9 +245,16 @@ class Tree:
                 fault = f"joint {joint + 1} is carried by joint {after + 1}"
                 raise InputError("E-ROBOT-BRANCH", f"{fault}; 0 (the base) or one that comes before needed")
 
+    def __bool__(self) -> bool:
+        return bool(self.mounts or self.carriers)
+
+    def carrier(self, joint: int) -> tuple[int, Rigid]:
+        """The joint that carries ``joint`` (−1: the base), and where its first row begins at the end of that one's."""
+        return self.mounts.get(joint, (joint - 1, Rigid()))
+
     def after(self, joint: int) -> int:
         """The joint that carries ``joint``; −1 for the base."""
-        return self.mounts[joint][0] if joint in self.mounts else joint - 1
+        return self.carrier(joint)[0]
 
     def path(self, joint: int) -> tuple[int, ...]:
         """Joints from the base to ``joint``."""
@@ -287,7 +294,7 @@ class Robot(Brief):
     world_from_base: Rigid = field(default_factory=lambda: Rigid())
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
     elasticity: Elasticity | None = None
-    tree: Tree | None = None
+    tree: Tree = field(default_factory=Tree)
     unusual_size: bool = False
 
     def __post_init__(self):
@@ -378,7 +385,7 @@ class Robot(Brief):
         gaps, ends, elasticity = [], [], self.elasticity
         pivots = np.zeros((len(self.rows), 3)) if elasticity is None else elasticity.pivot
         for i, row in enumerate(self.rows):
-            after, mount = self.carrier(i)
+            after, mount = self.tree.carrier(i)
             begin = (self.world_from_base if after < 0 else ends[after]) @ mount
             pivot = Rigid(translation=pivots[i])
             standard = self.convention == "standard"
@@ -396,11 +403,6 @@ class Robot(Brief):
             pivot=np.zeros_like(pivots),
         )
         return replace(chain, elasticity=moved)
-
-    def carrier(self, joint: int) -> tuple[int, Rigid]:
-        """Returns the joint, from 0, that carries another (−1: the base), and where the other's row begins."""
-        found = None if self.tree is None else self.tree.mounts.get(joint)
-        return found or (joint - 1, Rigid())
 
 
 def longest_link(rows: Sequence[DHRow]) -> list[Length]:
@@ -420,7 +422,7 @@ class Chain:
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
     first: in the world); ``ends`` : (n,) of the rows in their joints' frames, the last one is a serial arm's flange;
     ``prismatic`` : (n,); ``coupling`` : (n, N), of all N values of the controller; ``elasticity`` : of the links;
-    ``tree`` : one joint after the other if None; ``flange_joint`` : whose end is the flange, the last of a serial arm.
+    ``tree`` : empty of a serial arm; ``flange_joint`` : whose end is the flange, the last of a serial arm.
     """
 
     rotation: np.ndarray
@@ -429,7 +431,7 @@ class Chain:
     prismatic: np.ndarray
     coupling: np.ndarray
     elasticity: Elasticity | None = None
-    tree: Tree | None = None
+    tree: Tree = field(default_factory=Tree)
     flange_joint: int | None = None
 
     def __post_init__(self):
@@ -442,22 +444,17 @@ class Chain:
     def __len__(self) -> int:
         return len(self.prismatic)
 
-    @property
-    def order(self) -> Tree:
-        """The tree, without branches if the arm is serial."""
-        return self.tree or Tree({}, {"": len(self) - 1})
-
     def gap(self, i: int) -> Rigid:
         """Frame of joint ``i`` in that of the joint that carries it."""
         return Rigid(self.rotation[i], self.translation[i])
 
     def after(self, i: int) -> int:
         """The joint that carries joint ``i``; −1 for the world."""
-        return self.order.after(i)
+        return self.tree.after(i)
 
     def carrier(self, target: str) -> int:
         """The joint that carries a target."""
-        return self.order.carriers.get(target, len(self) - 1)
+        return self.tree.carriers.get(target, len(self) - 1)
 
     def carries(self, targets: Sequence[str]) -> np.ndarray:
         """(n, m) whether each joint moves each of the targets."""
@@ -475,20 +472,16 @@ class Chain:
         """Returns for every joint the sum, (n, …), over itself and the joints that it carries."""
         return np.tensordot(self.behind(), each, 1)
 
-    def passed(self, each: np.ndarray) -> np.ndarray:
-        """Returns for every joint the sum, (n, …), over itself and the joints that carry it."""
-        return np.tensordot(self.behind().T, each, 1)
-
     def branch(self, tool: str) -> "Chain":
         """Returns the chain whose flange is the one that carries the tool; other branches stay, and bend it."""
         return replace(self, flange_joint=self.carrier(tool))
 
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
-        if self.flange_joint is None and self.tree is not None:
+        if self.flange_joint is None and self.tree:
             fault = "the robot is a tree of joints, which has no one flange"
             raise InputError("E-ROBOT-TREE", f"{fault}; a robot file of one arm needed")
-        return self.order.path(len(self) - 1 if self.flange_joint is None else self.flange_joint)
+        return self.tree.path(len(self) - 1 if self.flange_joint is None else self.flange_joint)
 
     def parameters(self) -> list[tuple[int, int]]:
         """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz.

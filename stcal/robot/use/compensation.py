@@ -16,7 +16,7 @@ from stcal.io.json import Named, ResultFile, Shape, Vector
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS, csv_text
 from stcal.parallel import one_thread
-from stcal.robot.identification.adjustment import State, over_ranges
+from stcal.robot.identification.adjustment import State, over_ranges, position_errors
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import (
@@ -60,11 +60,11 @@ USUAL_SHARE, SAMPLE = 0.01, 50
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
     """Returns a note if two files may be of different robots, by their flanges. Raises InputError: they must be."""
-    ends = [""] if identified.tree is None else list(identified.tree.carriers)
+    ends = list(identified.tree.carriers) or [""]
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
     q = over_ranges(identified, SAMPLE, ends[0])
     off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
-    apart, reach = max(map(_rms, off)), max(reach_mm(each, ends) for each in (identified, nominal))
+    apart, reach = max(map(rms, map(position_errors, off))), max(reach_mm(each, ends) for each in (identified, nominal))
     if apart <= USUAL_SHARE * reach:
         return ""
     both = f"nominal robot {nominal.name} and identified robot {identified.name}"
@@ -86,7 +86,7 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     if targets.q is None:
         return False, _near_base(robot, targets, targets.poses)
     reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot, set(targets.tools))
-    own = _rms(reached.translation - targets.poses.translation)
+    own = rms(position_errors(reached.translation - targets.poses.translation))
     if own <= FITS * reach:
         require_orientations(targets.where, targets.tools, reached.rotation, targets.poses.rotation, many=False)
     else:
@@ -95,17 +95,12 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     return not notes, notes + (_near_base(robot, targets, targets.poses) if notes else ())
 
 
-def _rms(shift: np.ndarray) -> float:
-    """Returns the RMS length of vectors (m, 3)."""
-    return rms(np.linalg.norm(shift, axis=1))
-
-
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
     """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row."""
 
     def misfit(case: tuple[Poses, np.ndarray]) -> float:
         off = case[0].difference(poses_of(robot, targets, case[1]))
-        return np.inf if _rms(off[:, :3]) >= TURNED_RAD else _rms(off[:, 3:])
+        return np.inf if rms(np.linalg.norm(off[:, :3], axis=1)) >= TURNED_RAD else rms(position_errors(off))
 
     for best, left in explain(_mistakes(robot, poses, q), misfit, min(FITS * reach, EXPLAINS * own))[:1]:
         away = f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses"
@@ -245,7 +240,7 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
     with_own = replace(nominal, tools={**nominal.tools, **{name: identified.tools[name] for name in apart}})
     taken, poses, q = "identified file is taken in both", targets.poses, targets.q
     if apart.keys() <= nominal.tools.keys() and poses is not None and q is not None:
-        misses = [_rms(poses_of(each, targets, q).translation - poses.translation) for each in (nominal, with_own)]
+        misses = [rms(position_errors(poses_of(each, targets, q).difference(poses))) for each in (nominal, with_own)]
         if misses[0] < misses[1]:
             taken = "nominal file is taken in both (joint values beside the poses say so)"
             own_tools = {name: nominal.tools[name] for name in apart}
@@ -280,7 +275,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     if isinstance(targets, Poses):
         targets = Targets.from_poses(targets)
     both = [identified] if nominal is None else [identified, nominal]
-    builds = [[(joint.type, each.carrier(i)[0]) for i, joint in enumerate(each.joints)] for each in both]
+    builds = [[(joint.type, each.tree.after(i)) for i, joint in enumerate(each.joints)] for each in both]
     if builds[0] != builds[-1]:
         who = f"nominal robot {both[-1].name} and identified robot {identified.name}"
         fault = f"{who}: joints of different number, type or order"

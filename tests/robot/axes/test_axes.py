@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
+from stcal.robot import simulated
 from stcal.robot.axes.axes_model import pairs_of, robot_from_sweeps, slopes_of
 from stcal.robot.axes.fit import find_arcs, fit_axes, length_of, ring
 from stcal.robot.kinematics.forward import forward, joint_frames
@@ -297,19 +297,14 @@ def test_exactly_parallel_axes_have_no_common_normal(quick):
     assert pair.refused
 
 
-@pytest.fixture(scope="module")
-def fanuc(shared_data, tmp_path_factory):
-    """The tracked sweeps as our files: three rows for each of theirs, and an R-2000's nominal rows."""
+def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(shared_data, tmp_path):
+    """The tracked sweeps as our files, three rows for each of theirs, and an R-2000's nominal rows. Against 311.45,
+    1075.58, 226.08 mm of separate circle fits (SOURCE.txt), printed to 0.005 mm. Denavit and Hartenberg are refused for
+    the nearly parallel pair."""
     shared_data("fanuc_sweeps/N1N2N3Jval.csv")
-    folder = tmp_path_factory.mktemp("fanuc")
-    load_script("same_results").prepare(folder)
-    nominal = load_robot(folder / "fanuc.toml")
-    return robot_from_sweeps(read_measurements(folder / "fanuc.csv", nominal), nominal)
-
-
-def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(fanuc):
-    """Against 311.45, 1075.58, 226.08 mm of separate circle fits (SOURCE.txt), printed to 0.005 mm."""
-    result = fanuc
+    load_script("same_results").prepare(tmp_path)
+    nominal = load_robot(tmp_path / "fanuc.toml")
+    result = robot_from_sweeps(read_measurements(tmp_path / "fanuc.csv", nominal), nominal)
     rms = [np.sqrt((fit.lengths() ** 2).mean()) for fit in result.fits]  # of the points' vectors
     assert min(rms) > 0.02
     assert max(rms) < 0.04
@@ -320,10 +315,6 @@ def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(fanuc):
         assert abs(pair.distance_mm - wanted) < pair.distance_sigma_mm + 0.005
         assert 0.02 < pair.distance_sigma_mm < 0.2
     assert [abs(row.a) for row in result.robot.rows[:3]] == pytest.approx([p.distance_mm for p in result.pairs[:3]])
-
-
-def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
-    result = fanuc
     pair = result.pairs[1]
     assert np.pi - pair.angle_rad == pytest.approx(np.radians(0.0104), abs=2 * pair.angle_sigma_rad)
     assert abs(pair.foot_mm) == pytest.approx(5.9e6, abs=2 * pair.foot_sigma_mm)
@@ -346,15 +337,9 @@ PLACES = {"ring": ring(LENGTH_MM), "uneven": UNEVEN * LENGTH_MM / np.sqrt((UNEVE
 
 def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Measurements:
     """Poses of one target: σ of position, and of rotation as much at ``LENGTH_MM``."""
-    seen = robot.world_from_base @ forward(robot, q, "A")
-    rng = np.random.default_rng(seed)
-    turn = Rotation.from_rotvec(rng.normal(0, 1, (len(q), 3)) * sigma / LENGTH_MM).as_matrix()
-    places = seen.translation + rng.normal(0, 1, (len(q), 3)) * sigma
     covariance = np.tile(np.diag([(SIGMA / LENGTH_MM) ** 2] * 3 + [SIGMA**2] * 3), (len(q), 1, 1))
-    lines = range(2, 2 + len(q))
-    return Measurements(
-        "sweeps", lines, q, ("A",) * len(q), places, rotations=turn @ seen.rotation, covariance=covariance
-    )
+    seen = simulated.measured(robot, q, np.random.default_rng(seed), sigma, sigma / LENGTH_MM, ("A",) * len(q))
+    return replace(seen, covariance=covariance)
 
 
 def test_orientations_give_the_pose_of_the_target_too(quick):

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from stcal.adjust.blocks import Components, Equations
-from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import problem
 from stcal.robot.identification.adjustment import Weighting, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.problem import ArmProblem, Spread, huber_limit
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.robot_model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, measured
 from tests.outcome import refuses
+from tests.support.arms import seen_arm
 
 WEIGHTING = Weighting(0.05, 2e-4)
 
@@ -22,11 +22,7 @@ WEIGHTING = Weighting(0.05, 2e-4)
 @pytest.fixture(scope="module")
 def case():
     """A state far from what the instrument sees of a made arm, and what it sees: 40 poses, one with a gross error."""
-    rng = np.random.default_rng(3)
-    true = placed(
-        made(mh80(), rng), Rigid.exp([0.1, 0.2, -0.3, 900, 800, 700]), {"": Rigid.exp([0, 0, 0.4, 50, 0, 150])}
-    )
-    data = measured(true, joint_vectors(true, 40, rng), rng, 0.05, 2e-4, [""] * 40)
+    _, data = seen_arm(np.random.default_rng(3), 40)
     positions = data.positions.copy()
     positions[7] += [3.0, 0, 0]
     data = replace(data, positions=positions)

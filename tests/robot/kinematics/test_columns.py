@@ -1,21 +1,21 @@
 """Columns of robots' tables: angles in place of quaternions, and those that nothing reads."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import read_measurements, read_targets
 from stcal.robot.kinematics.robot_file import save_robot
-from stcal.robot.kinematics.robot_model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
+from stcal.robot.kinematics.robot_model import Robot, mh80
+from stcal.robot.simulated import measured
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from tests.outcome import fails_with
+from tests.support.arms import seen_arm
 
 WPR, ABC, OPEN = ("w_deg", "p_deg", "r_deg"), ("a_deg", "b_deg", "c_deg"), ("rx_deg", "ry_deg", "rz_deg")
 ORDER = {WPR: "xyz", ABC: "ZYX", OPEN: "XYZ"}
@@ -25,12 +25,8 @@ class Data:
     """40 poses of a made arm, with and without orientations as ``names`` state them, and more columns of ones."""
 
     def __init__(self, folder):
-        rng = np.random.default_rng(5)
         self.folder = folder
-        self.true = placed(
-            made(mh80(), rng), Rigid.exp([0.1, 0.2, 0.3, 500, 600, 700]), {"": Rigid.exp([0.1, 0.3, -0.2, 90, 20, 30])}
-        )
-        self.seen = measured(self.true, joint_vectors(self.true, 40, rng), rng)
+        self.true, self.seen = seen_arm(np.random.default_rng(5), 40)
         save_robot(folder / "robot.toml", mh80())
 
     def write(self, name: str, names: tuple[str, ...], *more: str, poses=None, joints: bool = True):
@@ -80,11 +76,8 @@ def test_an_open_convention_is_refused_and_a_needless_one_too(data):
                 read(data.write("data.csv", names), mh80(), rotation="yaskawa")
     (data.folder / "d.csv").write_text("q1_deg,distance_mm\n1,2\n")
     with fails_with("E-OPTION-NEEDS"):
-        read_measurements(
-            data.folder / "d.csv",
-            replace(mh80(), rows=mh80().rows[:1], joints=mh80().joints[:1], coupling=None),
-            rotation="yaskawa",
-        )
+        alone = Robot("one", "standard", mh80().rows[:1], mh80().joints[:1])
+        read_measurements(data.folder / "d.csv", alone, rotation="yaskawa")
 
 
 def test_columns_that_nothing_reads_are_named_and_the_known_ones_are_not(data):

@@ -2,13 +2,14 @@
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Targets, read_targets
@@ -18,14 +19,14 @@ from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv
 from tests.levels import sampled
 from tests.outcome import refuses
-from tests.support.arms import elastic
+from tests.support.arms import elastic, targets
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 FEW = 3
 
 
 class Case:
-    """Nominal and real robot as files, and 12 commanded poses; ``FEW`` where every branch is sought for each."""
+    """Nominal and real robot, and 12 commanded poses; ``FEW`` where every branch is sought for each."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -35,22 +36,20 @@ class Case:
         self.real = made(self.nominal, rng)
         self.q = joint_vectors(self.nominal, 12, rng, 0.7)
         self.poses = forward(self.nominal, self.q)
-        (folder / "nominal.toml").write_text(robot_toml(self.nominal))
-        (folder / "identified.toml").write_text(robot_toml(self.real))
 
-    def write(self, header: list[str], rows: list[list[str]]) -> Path:
+    def write(self, header: Sequence[str], rows: list[list[str]]) -> Path:
         path = self.folder / "targets.csv"
         path.write_text("\n".join(",".join(r) for r in [header, *rows]) + "\n")
         return path
 
-    def targets(self, header, rows) -> Targets:
-        return read_targets(self.write(list(header), rows), self.real)
+    def read(self, header: Sequence[str], rows: list[list[str]]) -> Targets:
+        return read_targets(self.write(header, rows), self.real)
 
     def pose_rows(self) -> list[list[str]]:
         return [pose_cells(p) for p in self.poses]
 
-    def joint_rows(self, q=None) -> list[list[str]]:
-        return [[repr(float(v)) for v in np.degrees(row)] for row in (self.q if q is None else q)]
+    def joint_rows(self) -> list[list[str]]:
+        return [[repr(float(v)) for v in np.degrees(row)] for row in self.q]
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def case(tmp_path):
 
 @pytest.mark.slow
 def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
-    result = compensate(case.real, case.targets(JOINTS, case.joint_rows()), case.nominal)
+    result = compensate(case.real, targets(None, case.q), case.nominal)
     reached = forward(case.real, result.found.q)
     assert result.found.usable.all()
     np.testing.assert_allclose(reached.translation, case.poses.translation, atol=1e-8)
@@ -74,7 +73,7 @@ def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
 
 
 def test_poses_alone_need_no_nominal_robot(case):
-    result = compensate(case.real, case.targets(POSE, case.pose_rows()[:FEW]))
+    result = compensate(case.real, targets(case.poses[:FEW]))
     assert result.found.usable.all()
     assert len(result.before_mm) == 0
     np.testing.assert_allclose(forward(case.real, result.found.q).translation, case.poses.translation[:FEW], atol=1e-8)
@@ -85,8 +84,7 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     flipped = case.q + np.array([0, 0, 0, np.pi, 0, np.pi])
     flipped[:, 4] *= -1
     flipped[:, 3] -= 2 * np.pi * (flipped[:, 3] > 2 * np.pi)
-    rows = [p + q for p, q in zip(case.pose_rows(), case.joint_rows(flipped), strict=True)]
-    found = compensate(case.real, case.targets([*POSE, *JOINTS], rows)).found
+    found = compensate(case.real, targets(case.poses, flipped)).found
     low, high = case.real.limits().T
     inside = ((flipped > low + 0.1) & (flipped < high - 0.1)).all(axis=1) & (np.abs(case.q[:, 4]) > 0.2)
     assert inside.sum() > 2
@@ -95,14 +93,13 @@ def test_joint_values_beside_poses_choose_the_branch(case):
 
 @pytest.mark.slow
 def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
-    targets = case.targets(JOINTS, case.joint_rows()[:FEW])
-    bare = replace(case.nominal, tools={"": Rigid()})
-    found = compensate(case.real, targets, bare)
+    given, bare = targets(None, case.q[:FEW]), replace(case.nominal, tools={"": Rigid()})
+    found = compensate(case.real, given, bare)
     assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between .* taken in both", found.notes()[0])
-    both = compensate(case.real, targets, replace(case.nominal, tools=case.real.tools))
+    both = compensate(case.real, given, replace(case.nominal, tools=case.real.tools))
     assert not any("differs by" in note for note in both.notes())
     np.testing.assert_allclose(found.found.q, both.found.q, atol=1e-9)
-    nameless = compensate(case.real, targets, replace(case.nominal, tools={"other": Rigid()})).notes()[0]
+    nameless = compensate(case.real, given, replace(case.nominal, tools={"other": Rigid()})).notes()[0]
     assert "is not in the nominal file: that of the identified file is taken in both" in nameless
 
 
@@ -111,8 +108,7 @@ def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
     """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
     bare = replace(case.nominal, tools={"": Rigid()})
     flange = forward(bare, case.q)
-    rows = [pose_cells(p) + q for p, q in zip(flange, case.joint_rows(), strict=True)]
-    found = compensate(case.real, case.targets([*POSE, *JOINTS], rows), bare)
+    found = compensate(case.real, targets(flange, case.q), bare)
     assert "nominal file is taken in both (joint values beside the poses say so)" in found.notes()[0]
     reached = forward(replace(case.real, tools={"": Rigid()}), found.found.q)
     np.testing.assert_allclose(reached.translation, flange.translation, atol=1e-8)
@@ -120,6 +116,7 @@ def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
 
 def test_poses_of_which_none_is_reached_are_an_error(case, stcal_robot):
     far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
+    (case.folder / "identified.toml").write_text(robot_toml(case.real))
     code, _, error = stcal_robot("compensate", case.write(POSE, far), "--robot", case.folder / "identified.toml")
     assert code == 3
     assert "none of 1 poses is reached" in error
@@ -128,24 +125,23 @@ def test_poses_of_which_none_is_reached_are_an_error(case, stcal_robot):
 def test_every_tool_by_its_name(case):
     names = ["ball" if i % 2 else "" for i in range(12)]
     rows = [[n, *q] for n, q in zip(names, case.joint_rows(), strict=True)]
-    result = compensate(case.real, case.targets(["target", *JOINTS], rows), case.nominal)
+    result = compensate(case.real, case.read(["target", *JOINTS], rows), case.nominal)
     for name in ("ball", ""):
         own = np.array([n == name for n in names])
         wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
         np.testing.assert_allclose(reached.translation, wanted.translation, atol=1e-8)
     real, nominal = (replace(robot, tools={"ball": robot.tools["ball"]}) for robot in (case.real, case.nominal))
-    posed = zip(forward(nominal, case.q[:FEW], "ball"), case.joint_rows()[:FEW], strict=True)
-    path = case.write(["target", *POSE, *JOINTS], [["ball", *pose_cells(pose), *q] for pose, q in posed])
-    assert "unreachable" not in compensate(real, read_targets(path, real), nominal).found.status
+    balls = targets(forward(nominal, case.q[:FEW], "ball"), case.q[:FEW], ["ball"] * FEW)
+    assert "unreachable" not in compensate(real, balls, nominal).found.status
     rows[3][0] = "cube"
-    refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.targets, ["target", *JOINTS], rows)
+    refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.read, ["target", *JOINTS], rows)
 
 
 @pytest.mark.slow
 def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
-    rows = case.pose_rows()[:FEW]
-    rows[1][:3] = ["5000", "0", "0"]
-    result = compensate(case.real, case.targets(POSE, rows), case.nominal)
+    places = case.poses.translation[:FEW].copy()
+    places[1] = [5000, 0, 0]
+    result = compensate(case.real, targets(Poses(case.poses.rotation[:FEW], places)), case.nominal)
     assert result.found.status[1] == "unreachable"
     note = result.notes()[0]
     assert note.startswith("line 3: no joint values reach it; ")
@@ -167,7 +163,7 @@ def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
 def test_limits_of_the_controller_are_respected(case):
     joints = [Joint("revolute", q - 1e-5, q + 1e-5) for q in case.q[0]]
     tight = replace(case.real, joints=tuple(joints))
-    result = compensate(tight, read_targets(case.write(JOINTS, case.joint_rows()[:1]), tight), case.nominal)
+    result = compensate(tight, targets(None, case.q[:1]), case.nominal)
     assert result.found.status == ("limit",)  # errors of 0.5 mrad need more than 0.01 mrad
     assert np.abs(result.found.q[0] - case.q[0]).max() <= 1e-5 + 1e-9
     assert 0.1 < result.found.error_mm[0] < result.before_mm[0]
@@ -183,8 +179,7 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
     q[:, 3], q[:, 4] = at, np.where(np.abs(q[:, 4]) < 0.3, 0.5, np.abs(q[:, 4]))
     joints = [replace(j, lower=at, upper=-at) if i == 3 else j for i, j in enumerate(case.nominal.joints)]
     real, drawn = (replace(robot, joints=tuple(joints)) for robot in (case.real, case.nominal))
-    rows = [p + q for p, q in zip(map(pose_cells, forward(drawn, q)), case.joint_rows(q), strict=True)]
-    result = compensate(real, read_targets(case.write([*POSE, *JOINTS], rows), real), drawn if nominal else None)
+    result = compensate(real, targets(forward(drawn, q), q), drawn if nominal else None)
     stopped = np.array([status == "limit" for status in result.found.status])
     assert stopped.sum() > 5
     assert np.abs(result.found.q - q).max() < 0.1
@@ -198,18 +193,18 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
 def test_a_long_way_near_a_singularity_is_told(case):
     """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
-    result = compensate(case.real, case.targets(JOINTS, case.joint_rows(q)), case.nominal)
+    result = compensate(case.real, targets(None, q), case.nominal)
     moved = np.degrees(np.abs(result.found.q - q).max())
     assert moved > 1
     assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
 
 
 def test_bad_targets_are_named(case):
-    refuses("E-TARGETS-NO-POSES … x_mm", case.targets, ["a", "b"], [["1", "2"]])
-    refuses("E-TARGETS-NO-ORIENTATION", case.targets, POSE[:3], [["1", "2", "3"]])
-    refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, case.targets(JOINTS, case.joint_rows()))
+    refuses("E-TARGETS-NO-POSES … x_mm", case.read, ["a", "b"], [["1", "2"]])
+    refuses("E-TARGETS-NO-ORIENTATION", case.read, POSE[:3], [["1", "2", "3"]])
+    refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, targets(None, case.q))
     shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
-    refuses("E-ROBOT-MISMATCH", compensate, case.real, case.targets(POSE, case.pose_rows()), shorter)
+    refuses("E-ROBOT-MISMATCH", compensate, case.real, targets(case.poses), shorter)
     for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
         path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
         refuses(message, read_targets, path, case.real, payload_kg=option)
@@ -221,7 +216,7 @@ def test_each_row_is_compensated_for_its_payload(case):
     mass, poses = np.tile([0.0, 80.0], 2), case.poses[:4]
     at = zip(case.pose_rows()[:4], case.joint_rows()[:4], mass, strict=True)
     rows = [[*row, *q, f"{m:g}"] for row, q, m in at]
-    result = compensate(bent, case.targets([*POSE, *JOINTS, "payload_kg"], rows), case.nominal)
+    result = compensate(bent, case.read([*POSE, *JOINTS, "payload_kg"], rows), case.nominal)
     assert set(result.found.status) == {"reached"}
     reached = forward(bent, result.found.q, payload_kg=mass)
     assert np.abs(poses.difference(reached)[:, 3:]).max() < 1e-8
@@ -231,18 +226,15 @@ def test_each_row_is_compensated_for_its_payload(case):
 
 
 def test_files_that_are_exchanged_or_the_same_are_told(case):
-    targets = case.targets(JOINTS, case.joint_rows()[:1])
-    good = compensate(case.real, targets, case.nominal).notes()
+    given = targets(None, case.q[:1])
+    good = compensate(case.real, given, case.nominal).notes()
     assert not any("as drawn" in note or "are the same" in note for note in good)
-    assert "as if they were exchanged" in compensate(case.nominal, targets, case.real).notes()[0]
-    assert "are the same, so that nothing is compensated" in compensate(case.real, targets, case.real).notes()[0]
+    assert "as if they were exchanged" in compensate(case.nominal, given, case.real).notes()[0]
+    assert "are the same, so that nothing is compensated" in compensate(case.real, given, case.real).notes()[0]
 
 
 def test_axes_that_are_exchanged_and_radians_without_poses_are_told(case):
-    exchanged = [[y, x, *others] for x, y, *others in case.pose_rows()[:FEW]]
-    rows = [pose + q for pose, q in zip(exchanged, case.joint_rows()[:FEW], strict=True)]
-    targets = case.targets([*POSE, *JOINTS], rows)
-    refuses("E-ROBOT-MISMATCH … if x, y, z were y, x, z", compensate, case.real, targets, case.nominal)
-    radians = case.targets(JOINTS, case.joint_rows(np.radians(case.q[:FEW])))
-    notes = compensate(case.real, radians, case.nominal).notes()
+    q, exchanged = case.q[:FEW], Poses(case.poses.rotation[:FEW], case.poses.translation[:FEW][:, [1, 0, 2]])
+    refuses("E-ROBOT-MISMATCH … if x, y, z were y, x, z", compensate, case.real, targets(exchanged, q), case.nominal)
+    notes = compensate(case.real, targets(None, np.radians(q)), case.nominal).notes()
     assert any("as of radians in columns of degrees" in note for note in notes)

@@ -8,13 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import Targets
 from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, on_targets, robots_apart
 from tests.levels import sampled
 from tests.outcome import refuses
-from tests.support.arms import scara
+from tests.support.arms import scara, targets
 
 TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])
 
@@ -29,10 +28,6 @@ def arm(seed: int, size: float = 1.0) -> Robot:
 
 def sliding(_: int) -> Robot:
     return replace(scara(), tools={"": TOOL})
-
-
-def targets(poses: Poses, q=None) -> Targets:
-    return Targets("targets t.csv", range(2, len(poses) + 2), ("",) * len(poses), poses, q)
 
 
 def commanded(robot: Robot, count: int, seed: int, share: float = 0.6) -> tuple[np.ndarray, Poses]:
@@ -97,7 +92,7 @@ def test_a_nominal_robot_of_another_arm_is_refused():
     nominal = arm(4)
     real = made(nominal, np.random.default_rng(4))
     q, poses = commanded(nominal, 3, 4)
-    for given in (targets(poses, q), targets(poses), Targets("t", [2, 3, 4], ("",) * 3, None, q)):
+    for given in (targets(poses, q), targets(poses), targets(None, q)):
         refuses("E-ROBOT-MISMATCH", compensate, real, given, arm(5))
 
 

@@ -101,13 +101,18 @@ def test_commands_of_another_robot_are_said(off_mm, warned):
     rng = np.random.default_rng(3)
     commanded, away = rng.uniform(-1000, 1000, (40, 3)), rng.normal(0, 1, (40, 3))
     wrong = commanded + off_mm * away / np.linalg.norm(away, axis=1, keepdims=True)
-
-    def result_of(positions):
-        return verify(MeasuredPoses("t", range(2, 42), ("a",) * 40, tuple(map(str, range(40))), commanded, positions))
-
-    warnings = result_of(wrong / result_of(wrong).sets[0].scale).warnings()
+    warnings = verified(commanded, a=wrong / verified(commanded, a=wrong).sets[0].scale).warnings()
     assert len(warnings) == warned
     assert all("set a: measured distances miss the commanded ones by" in warning for warning in warnings)
+
+
+def verified(commanded: np.ndarray, **sets: np.ndarray) -> Verification:
+    """Of sets of poses P1, P2 … that are commanded to (m, 3) and measured at (m, 3)."""
+    m, names = len(commanded), tuple(f"P{i}" for i in range(1, len(commanded) + 1)) * len(sets)
+    of_sets, every = np.repeat(list(sets), m).tolist(), np.tile(commanded, (len(sets), 1))
+    return verify(
+        MeasuredPoses("t", range(2, len(names) + 2), tuple(of_sets), names, every, np.vstack([*sets.values()]))
+    )
 
 
 def ten_poses(change) -> str:
@@ -115,19 +120,15 @@ def ten_poses(change) -> str:
     rng = np.random.default_rng(4)
     commanded = rng.uniform(-500, 500, (10, 3))
     at = MOVED @ (commanded + rng.normal(0, 0.2, commanded.shape))
-    names = tuple(f"P{i}" for i in range(1, 11))
-    data = MeasuredPoses("x.csv", range(2, 12), ("after",) * 10, names, commanded, change(at))
-    return verify(data).sets[0].doubt()
+    return verified(commanded, after=change(at)).sets[0].doubt()
 
 
 def ten_of_two_sets(first, second) -> Verification:
     """Ten poses in two sets, each measured to ``first`` and ``second`` mm in the robot's frame."""
     rng = np.random.default_rng(5)
     commanded = rng.uniform(-500, 500, (10, 3))
-    measured = [commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second)]
-    names = tuple(map(str, range(10))) * 2
-    sets = ("before",) * 10 + ("after",) * 10
-    return verify(MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)))
+    before, after = (commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second))
+    return verified(commanded, before=before, after=after)
 
 
 def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
@@ -135,7 +136,7 @@ def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     assert "set after errs more than set before" in " ".join(ten_of_two_sets(0.1, 1.0).warnings()).replace(": ", " ")
     assert "errs as set before does" in ten_of_two_sets(1.0, 1.0).warnings()[0]
     ten = np.random.default_rng(6).uniform(-500, 500, (10, 3))
-    larger = verify(MeasuredPoses("t", range(2, 12), ("a",) * 10, tuple("abcdefghij"), ten, 1.002 * ten))
+    larger = verified(ten, a=1.002 * ten)
     assert "1.00200 times the commanded ones, which is most of its error" in larger.warnings()[0]
     assert "are the commanded ones to the last digit" in ten_of_two_sets(0.0, 0.1).warnings()[0]
     both = ten_of_two_sets(1.0, 0.0)
