@@ -23,7 +23,7 @@ from stcal.report.document import (
 )
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
-from stcal.robot.identification.adjustment import MEANING, Observed, State
+from stcal.robot.identification.adjustment import MEANING, Observed, State, sigma_of
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS
 from stcal.robot.identification.result import ERRORS, Identified
@@ -212,7 +212,7 @@ def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, n
     change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]
     jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[joints, at]
     k = jacobian.shape[1]
-    sigma = np.sqrt(np.einsum("nk,kl,nl->n", jacobian, result.covariance[:k, :k], jacobian).clip(0))
+    sigma = sigma_of(jacobian, result.covariance[:k, :k])
     open_ = result.dh_sigma[joints, at] == 0
     open_[[turn for turn, _ in result.adjustment.rows.coaxial]] = True
     return change, sigma, (np.abs(back) > 0) @ open_ == 0

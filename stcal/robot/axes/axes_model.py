@@ -26,7 +26,7 @@ from stcal.robot.axes.fit import (
     fit_axes,
     virtual_reflectors,
 )
-from stcal.robot.identification.adjustment import State, observed
+from stcal.robot.identification.adjustment import State, observed, sigma_of
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.unexplained import moved_meanwhile
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
@@ -220,7 +220,7 @@ def robot_from_sweeps(
         covariance=covariance,
         chain=axes,
         robot=robot,
-        row_sigma=_sigma_of(slopes[:rows], covariance).reshape(-1, 5),
+        row_sigma=sigma_of(slopes[:rows], covariance).reshape(-1, 5),
         tool_spread_mm=spread,
         pairs=pairs,
         without_one=_leave_one_out(data, fits, nominal, slopes @ passed),
@@ -260,11 +260,6 @@ def slopes_of(frames: list[Rigid], nominal: Robot) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def _sigma_of(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Returns σ (v,) of values from their ``jacobian`` (v, p) by parameters with this covariance (p, p)."""
-    return np.sqrt(np.maximum(np.einsum("vp,pq,vq->v", jacobian, covariance, jacobian), 0))
-
-
 def _values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
     """Returns the rows (5 n,) of the robot with these axes, and values (6 (n − 1),) of the pairs: the acute angle as a
     vector (3), the rows' distance, and the common normal's length and foot from the axis's origin (nan with a prismatic
@@ -299,7 +294,7 @@ def pairs_of(
         spread = jacobian[:3] @ covariance @ jacobian[:3].T  # of the angle's vector
         # of exactly parallel axes the largest σ of that
         variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
-        sigma = np.where(np.isfinite(value[3:]), _sigma_of(jacobian[3:], covariance), np.nan)
+        sigma = np.where(np.isfinite(value[3:]), sigma_of(jacobian[3:], covariance), np.nan)
         numbers = np.column_stack([[*np.abs(value[3:5]), value[5]], sigma]).ravel().tolist()
         lengths: list[Any] = [number if np.isfinite(number) else None for number in numbers]
         angle, parallel = np.pi - acute if opposed else acute, bool(np.sin(acute) < np.sin(PARALLEL_RAD))

@@ -90,7 +90,7 @@ class State:
             begin = len(self.parameter_names(measured.kind)) - 6 * (len(self.stations) - 1)
             for s, name in enumerate(list(self.stations)[1:]):
                 at = begin + 6 * s
-                full[names == name, :, at : at + 6] = frame_motions(tip[names == name], np.zeros(3))
+                full[names == name, :, at : at + 6] = frame_motions(tip.translation[names == name], np.zeros(3))
         return self.residuals(measured, tip), self.as_seen(measured, tip, full)
 
     def curvature(self, measured: "Observed", pull: np.ndarray) -> np.ndarray:
@@ -208,11 +208,12 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     return Observed(kind, data, real, from_row[real], distances[real])
 
 
-def frame_motions(tip: Poses, centre: np.ndarray) -> np.ndarray:
-    """Returns the motions (m, 6, 6) of the tools with the world, by its small rotations about ``centre`` and shifts."""
-    moves = np.zeros((len(tip), 6, 6))
+def frame_motions(xyz: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Returns the motions (m, 6, 6) of tools at (m, 3) with the world, by its small rotations about ``centre`` and
+    shifts."""
+    moves = np.zeros((len(xyz), 6, 6))
     moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
-    moves[:, 3:, :3] = -skew(tip.translation - centre)
+    moves[:, 3:, :3] = -skew(xyz - centre)
     return moves
 
 
@@ -296,6 +297,11 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
     moves, turns = (np.sqrt((part**2).sum(1).mean(0)) for part in (derivative[:, -3:], derivative[:, :-3]))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
+
+
+def sigma_of(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Returns σ (…) of values from their ``jacobian`` (…, k) by parameters with this covariance (k, k)."""
+    return np.sqrt(((jacobian @ covariance) * jacobian).sum(-1).clip(0))
 
 
 def position_errors(found: np.ndarray) -> np.ndarray:

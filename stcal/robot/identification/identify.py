@@ -19,6 +19,7 @@ from stcal.robot.identification.adjustment import (
     Observed,
     State,
     Weighting,
+    frame_motions,
     observed,
     parameter_scale,
     parameter_units,
@@ -277,12 +278,9 @@ def _observability(robot: Robot, solution: ArmSolution, rank: int) -> Observabil
     scale = parameter_scale(robot, measured.kind, state.tools)
     rows = weighting.whiten(state.jacobian(measured)[:, :, : len(scale)], measured) * scale
     if measured.frameless:  # remove what a motion of all points of a station can produce
-        blocks, points = [], measured.data.points()
-        for within in measured.data.by_station().values():
-            lever = (points - points[within].mean(0)) * within[:, None]
-            turn, shift = -skew(lever) / np.linalg.norm(lever), np.eye(3) * within[:, None, None]
-            blocks += [turn, shift]
-        motions = np.concatenate(blocks, axis=2)
+        points, stations = measured.data.points(), measured.data.by_station().values()
+        moves = [frame_motions(points, points[own].mean(0))[:, 3:] * own[:, None, None] for own in stations]
+        motions = np.concatenate(moves, axis=2)
         u, s, _ = np.linalg.svd(weighting.whiten(motions, measured).reshape(-1, motions.shape[2]), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
         rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Kind, State
+from stcal.robot.identification.adjustment import Kind, State, sigma_of
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import GRAVITY_M_S2
 from stcal.robot.kinematics.robot_model import USUAL, Chain, Conditions, Elasticity, Robot
@@ -137,8 +137,7 @@ class Deviations:
 
     def of(self, groups: np.ndarray) -> dict[str, float | None]:
         """Returns the σ by name; None for groups in which the robot has no dimensions."""
-        present = np.isin(np.arange(len(astuple(self))), groups)
-        return {k: v if there else None for (k, v), there in zip(asdict(self).items(), present, strict=True)}
+        return {name: sigma if g in groups else None for g, (name, sigma) in enumerate(asdict(self).items())}
 
 
 def dh_values(robot: Robot) -> np.ndarray:
@@ -231,9 +230,8 @@ class NominalRows:
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
         """Returns σ (n, 5) of the rows of ``robot`` from the parameters' covariance (k, k)."""
         jacobian = self.by_parameters(robot)
-        covariance = covariance[: jacobian.shape[2], : jacobian.shape[2]]
-        sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
-        return np.where(self.fixed, 0.0, sigma)
+        k = jacobian.shape[2]
+        return np.where(self.fixed, 0.0, sigma_of(jacobian, covariance[:k, :k]))
 
     def by_parameters(self, robot: Robot) -> np.ndarray:
         """Returns the derivatives (n, 5, k) of the rows of ``robot`` (a, alpha, d, theta, beta) by the parameters."""
@@ -296,7 +294,7 @@ def placed(
 
     state = replace(state, elastic=False)
     derivative = np.stack([slope(step) for step in DIFFERENCE_MM * np.diag(units)], axis=2)
-    sigma = np.sqrt(np.einsum("pik,kl,pil->pi", derivative, covariance, derivative).clip(0))
+    sigma = sigma_of(derivative, covariance)
     if kind != "pose":
         sigma[1 : 1 + len(state.tools), :3] = np.nan
     if kind == "distance":

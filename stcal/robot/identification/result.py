@@ -23,6 +23,7 @@ from stcal.robot.identification.adjustment import (
     Weighting,
     over_ranges,
     position_errors,
+    sigma_of,
 )
 from stcal.robot.identification.prior import Adjusted, PlacedFrame, dh_values
 from stcal.robot.identification.problem import GROSS, ArmSolution
@@ -174,8 +175,11 @@ class Predicted:
         data = seen.data
         target = max(dict.fromkeys(data.targets), key=data.targets.count)
         q = over_ranges(replace(robot, tools={"": Rigid()}), SAMPLES)
-        here = position_sigma(state, data.q, data.targets, seen.kind, covariance, data.conditions)
-        ranges = position_sigma(state, q, (target,) * SAMPLES, seen.kind, covariance)
+
+        def sigma(q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> np.ndarray:
+            return position_errors(sigma_of(state.tip_jacobian(q, targets, seen.kind, conditions)[1], covariance))
+
+        here, ranges = sigma(data.q, data.targets, data.conditions), sigma(q, (target,) * SAMPLES)
         effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
         return cls(here, ranges, covariance, float(np.sqrt((effects**2).sum())))
 
@@ -189,22 +193,9 @@ class Predicted:
         the residuals; nan for tools that were not measured."""
         sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
         if known.any():
-            of_known = [name for name in targets if name in state.tools]
-            sigma[known] = np.hypot(position_sigma(state, q[known], of_known, kind, self.covariance), self.left_mm)
+            moves = state.tip_jacobian(q[known], [name for name in targets if name in state.tools], kind)[1]
+            sigma[known] = np.hypot(position_errors(sigma_of(moves, self.covariance)), self.left_mm)
         return sigma
-
-
-def position_sigma(
-    state: State,
-    q: np.ndarray,
-    targets: Sequence[str],
-    kind: Kind,
-    covariance: np.ndarray,
-    conditions: Conditions = USUAL,
-) -> np.ndarray:
-    """Returns σ (r,) of the position at joint values (r, n), mm."""
-    place = state.tip_jacobian(q, targets, kind, conditions)[1][:, 3:]
-    return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)

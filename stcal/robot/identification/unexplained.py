@@ -224,7 +224,7 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
         order.append(_Effect(what, joint, state.as_seen(measured, tip, motions), 0, advice, slides))
 
     another = "name these rows another {0} (column {0}), or measure again"
-    frame = frame_motions(tip, tip.translation.mean(0))
+    frame = frame_motions(tip.translation, tip.translation.mean(0))
     add("the instrument or the robot's base elsewhere", frame, another.format("station"))
     for name in dict.fromkeys(data.targets):
         on_flange = tool_motions(tip, data.targets, name, measured.kind)

@@ -1,7 +1,7 @@
 """Inverse kinematics of any serial arm: many poses at once, joint limits, nearest branch."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,10 +71,9 @@ class Inverse(Brief):
 
     def with_rows(self, rows: Sequence[int], other: "Inverse") -> "Inverse":
         """Returns these joint vectors, with those of ``other`` in some rows."""
-        q, status, error_mm, error_rad = self.q.copy(), [*self.status], self.error_mm.copy(), self.error_rad.copy()
-        q[rows], error_mm[rows], error_rad[rows] = other.q, other.error_mm, other.error_rad
-        for row, each in zip(rows, other.status, strict=True):
-            status[row] = each
+        q, status = self.q.copy(), np.array(self.status, object)
+        error_mm, error_rad = self.error_mm.copy(), self.error_rad.copy()
+        q[rows], status[rows], error_mm[rows], error_rad[rows] = other.q, other.status, other.error_mm, other.error_rad
         return Inverse(q, tuple(status), error_mm, error_rad)
 
     @property
@@ -260,11 +259,7 @@ class InverseProblem:
                 last = q[i]
         missing = np.flatnonzero(~ok)
         q[missing] = self.solve(poses[missing], np.clip(q[missing], *self.bounds.T), self.bounds)
-        judged = self.judge(poses, q)
-        # An arm of more than six joints may get there on the second way, within the limits.
-        over = ~ok & beyond & (np.array(judged.status, object) == UNREACHABLE)
-        status = np.where(over, LIMIT, np.array(judged.status, object))
-        return replace(judged, status=tuple(status))
+        return self.judge(poses, q, beyond)
 
     def every_solution(self, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
         """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), ignoring limits."""
@@ -336,11 +331,12 @@ class InverseProblem:
         """Returns the smallest singular value (m,) of the unitless Jacobian."""
         return np.linalg.svd(self.jacobian(q), compute_uv=False)[:, -1] if len(q) else np.zeros(0)
 
-    def judge(self, poses: Poses, q: np.ndarray) -> Inverse:
-        """Returns the status of joint vectors, ignoring limits."""
+    def judge(self, poses: Poses, q: np.ndarray, beyond: np.ndarray | bool = False) -> Inverse:
+        """Returns the status of joint vectors; ``beyond`` : (m,) whether others, beyond the limits, reach the pose."""
         off = self.errors(poses, q)
         error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
         reached, singular = self._is_reached(off), self._weakest(q) < SINGULAR
-        status = np.where(~reached, UNREACHABLE, np.where(singular, SINGULAR_POSE, REACHED)).astype(object)
+        missed = np.where(beyond, LIMIT, UNREACHABLE)
+        status = np.where(reached, np.where(singular, SINGULAR_POSE, REACHED), missed).astype(object)
         status[reached & (error_rad > WITHIN_RAD)] = ORIENTATION
         return Inverse(q * self.unit, tuple(status), error_mm, error_rad)

@@ -475,14 +475,13 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
     good = measured[np.flatnonzero(~wrong)]
     tip, moves = state.tips_of(good.data), [np.zeros((len(good.data), 6, 0))]
     if "base" in fit and good.kind != "distance":
-        moves.append(frame_motions(tip, base.translation))
+        moves.append(frame_motions(tip.translation, base.translation))
     if "tool" in fit:
         moves += [tool_motions(tip, good.data.targets, name, good.kind) for name in state.tools]
     fitted, one = state.as_seen(good, tip, np.concatenate(moves, axis=2)), Weighting(1.0, 1.0)
     seeks = np.concatenate([fitted, state.jacobian(good)], axis=2)
     if in_base.shape[1] == 3:
-        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
-        in_base = np.einsum("nji,nj->ni", np.array(stations), in_base) @ base.rotation
+        in_base = (in_base[:, None] @ state.seen_from(measured.data.stations).rotation)[:, 0] @ base.rotation
     return Evaluated(
         robot=replace(robot, world_from_base=base, tools=state.tools),
         state=state,

@@ -368,7 +368,7 @@ def test_the_length_is_that_at_which_both_errors_are_alike():
 
 @pytest.mark.full
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
-def test_orientations_help_and_their_covariance_is_true(places):
+def test_orientations_help_and_their_covariance_is_true(places, quick):
     """40 trials of 6 axes of 4 parameters: the mean square over σ² scatters by √(2/960) = 5 %, and by more since axes
     share what the unwinding passes on. Points that share the errors of a pose are not taken for independent."""
     nominal = mh80()

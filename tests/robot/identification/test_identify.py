@@ -258,8 +258,8 @@ OFF = np.radians([0, 0.4, -0.3, 0.5, -0.2, 0])
 """Of the joints of the arm; the first and the last joint's are the base's and the tool's too."""
 
 
-@pytest.fixture(scope="module")
-def offset():
+def test_zeros_are_what_was_put_in():
+    """With them the nominal robot is the arm, and the table says so."""
     rng = np.random.default_rng(3)
     nominal = replace(mh80(), coupling=COUPLING)
     rows = tuple(replace(row, theta=row.theta + off) for row, off in zip(nominal.rows, OFF, strict=True))
@@ -267,11 +267,6 @@ def offset():
     true = placed(replace(nominal, rows=rows), world, {"": tool})
     q = joint_vectors(nominal, 60, rng, 0.5)
     found = identify(nominal, measured(true, q, rng, sigma_mm=0.02, sigma_rad=2e-5), IdentifyOptions(folds=0))
-    return nominal, true, found, q
-
-
-def test_zeros_are_what_was_put_in(offset):
-    nominal, _, found, _ = offset
     change, sigma, known = zeros(found, nominal)
     assert known.tolist() == [False, True, True, True, True, False]  # J6 turns with J4, and its own zero is open
     wanted = np.linalg.solve(COUPLING, OFF)
@@ -279,20 +274,11 @@ def test_zeros_are_what_was_put_in(offset):
     assert error.max() < 4
     assert (sigma[known] < np.radians(0.01)).all()
     assert np.abs(change - OFF)[2] > np.radians(0.1)  # not those of the arm's joints
-
-
-def test_the_nominal_robot_with_other_joint_values_is_the_arm(offset):
-    nominal, true, found, q = offset
-    change, _, _ = zeros(found, nominal)
     placed_ = replace(nominal, world_from_base=found.robot.world_from_base, tools=found.robot.tools)
     before, after = ((r.world_from_base @ forward(r, v)).translation for r, v in ((placed_, q), (placed_, q + change)))
     wanted = (true.world_from_base @ forward(true, q)).translation
     assert np.linalg.norm(before - wanted, axis=1).mean() > 3
     assert np.linalg.norm(after - wanted, axis=1).mean() < 0.3  # what the noise leaves open of lengths and twists
-
-
-def test_table(offset):
-    nominal, _, found, _ = offset
     rows = list(csv.DictReader(offsets_csv(found, nominal).splitlines()))
     assert tuple(rows[0]) == HEAD
     assert len(rows) == 6 * 6
