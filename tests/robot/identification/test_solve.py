@@ -220,7 +220,7 @@ def test_rokae_held_out(rokae):
     ],
 )
 def test_stated_sigma_that_residuals_contradict_are_told(options, said):
-    notes = identify(mh80(), simulated(32, 30)[1], replace(QUICK, **options)).notes
+    notes = identify(mh80(), simulated(32, 60)[1], replace(QUICK, **options)).notes
     told = [note for note in notes if "that are stated" in note]
     assert told == [note for note in notes if said and said in note]
     assert bool(told) == bool(said)
