@@ -47,6 +47,7 @@ MARKS = {
     "diamond": "m0 -{1:.1f}l{1:.1f} {1:.1f}l-{1:.1f} {1:.1f}l-{1:.1f} -{1:.1f}z",
 }
 """Path of each mark from its middle; {0} is its size, {1} half of it, pt."""
+STROKES = {"ring": 1.0, "dash": 1.4, "bar": 1.4}  # widths of the lines of marks that are not filled, pt
 Ticks = tuple[Sequence[float], Sequence[str]]  # values of an axis, and their words
 UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")  # characters that no XML file may contain
 
@@ -96,12 +97,11 @@ class Drawing:
     def marks(self, xy: np.ndarray, kind: str, size: float, colour: str, opacity: float = 1.0) -> None:
         """Draws a mark at each place (n, 2): dot, ring, dash, bar, triangle, square or diamond."""
         path = "".join(f"M{x:.1f} {y:.1f}" + MARKS[kind].format(size, size / 2) for x, y in xy.tolist())
+        look = f'fill="{colour}"'
         if kind == "dot":
             look = f'stroke="{colour}" stroke-opacity="{opacity:g}" stroke-width="{size:g}" stroke-linecap="round"'
-        elif kind in ("ring", "dash", "bar"):
-            look = f'fill="none" stroke="{colour}" stroke-width="{1.0 if kind == "ring" else 1.4:g}"'
-        else:
-            look = f'fill="{colour}"'
+        elif kind in STROKES:
+            look = f'fill="none" stroke="{colour}" stroke-width="{STROKES[kind]:g}"'
         if path:
             self._parts.append(f'<path d="{path}" {look}/>')
 
@@ -109,7 +109,7 @@ class Drawing:
         """Draws a legend to the right of a place: by its words, the kind of mark and the colour of each entry."""
         x, y = at
         for text, (kind, colour) in entries.items():
-            self.marks(np.array([[x + 4, y]]), kind, 6.0 if kind in ("ring", "dash", "bar") else 4.5, colour)
+            self.marks(np.array([[x + 4, y]]), kind, 6.0 if kind in STROKES else 4.5, colour)
             self.words((x + 12, y), text, anchor="start")
             x += 28 + LETTER * SMALL * len(text)
 
@@ -153,16 +153,6 @@ class Drawing:
             self.lines([np.array([[right, y], [right + 2, y]])], AXIS, 0.8)
             self.words((right + 4, y), text, SMALL - 1, "start")
         self.words(((left + right) / 2, top - 8), title)
-
-    def picture(self, box: Box, rgba: np.ndarray) -> None:
-        """Draws an image (rows, columns, 4), 8 bit, into a box."""
-        stream = io.BytesIO()
-        Image.fromarray(rgba).save(stream, "PNG")
-        left, top, right, bottom = box
-        self._parts.append(
-            f'<image x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{bottom - top:.1f}" '
-            f'preserveAspectRatio="none" href="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"/>'
-        )
 
     def svg(self) -> str:
         """Returns the text of the drawing; equal drawings give equal text."""
@@ -212,7 +202,7 @@ class Axes:
         return np.stack(np.broadcast_arrays(across, down), axis=-1).reshape(-1, 2)
 
     def _share(self, axis: str, values) -> np.ndarray:
-        ends, values = np.asarray(self.x if axis == "x" else self.y, float), np.asarray(values, float)
+        ends, values = np.asarray(getattr(self, axis), float), np.asarray(values, float)
         if axis in self.log:
             ends, values = np.log(ends), np.log(np.maximum(values, ends[0]))
         return (values - ends[0]) / (ends[1] - ends[0])
@@ -256,7 +246,12 @@ class Axes:
             share = np.minimum(np.floor(share * bands), bands - 1) / max(bands - 1, 1)
         rgba = np.dstack([mixed(share, ramp), np.where(known, 255, 0)]).astype(np.uint8)
         (x0, y0), (x1, y1) = self.at(extent[::2], extent[1::2])
-        self.drawing.picture((x0, min(y0, y1), x1, max(y0, y1)), rgba if y0 < y1 else rgba[::-1])
+        stream = io.BytesIO()
+        Image.fromarray(rgba if y0 < y1 else rgba[::-1]).save(stream, "PNG")
+        self.drawing._parts.append(
+            f'<image x="{x0:.1f}" y="{min(y0, y1):.1f}" width="{x1 - x0:.1f}" height="{abs(y1 - y0):.1f}" '
+            f'preserveAspectRatio="none" href="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"/>'
+        )
 
     def frame(
         self,
@@ -270,28 +265,28 @@ class Axes:
         """Draws left and lower line with ticks (values and words) and the names of the axes; ``grid`` : the axes whose
         ticks get lines across."""
         drawing, (left, top, right, bottom) = self.drawing, self.box
-        x_values, x_texts = self._ticks("x", (right - left) / 45) if x_ticks is None else x_ticks
-        y_values, y_texts = self._ticks("y", (bottom - top) / 22) if y_ticks is None else y_ticks
-        rows, columns = self.at(self.x[0], y_values), self.at(x_values, self.y[0])
+        x_values, x_texts = x_ticks or self._ticks("x", (right - left) / 45)
+        y_values, y_texts = y_ticks or self._ticks("y", (bottom - top) / 22)
+        rows, columns = self.at(self.x[0], y_values)[:, 1], self.at(x_values, self.y[0])[:, 0]
         if "y" in grid:
-            drawing.lines([np.array([[left, row], [right, row]]) for row in rows[:, 1]], FAINT, 0.6)
+            drawing.lines([np.array([[left, row], [right, row]]) for row in rows], FAINT, 0.6)
         if "x" in grid:
-            drawing.lines([np.array([[column, top], [column, bottom]]) for column in columns[:, 0]], FAINT, 0.6)
-        marks = [np.array([[left, row], [left - 2, row]]) for row in rows[:, 1]]
-        marks += [np.array([[column, bottom], [column, bottom + 2]]) for column in columns[:, 0]]
+            drawing.lines([np.array([[column, top], [column, bottom]]) for column in columns], FAINT, 0.6)
+        marks = [np.array([[left, row], [left - 2, row]]) for row in rows]
+        marks += [np.array([[column, bottom], [column, bottom + 2]]) for column in columns]
         drawing.lines([np.array([[left, top], [left, bottom], [right, bottom]]), *marks], AXIS, 0.8)
-        for (_, row), text in zip(rows, y_texts, strict=True):
+        for row, text in zip(rows, y_texts, strict=True):
             drawing.words((left - 4.5, row), text, anchor="end")
-        for (column, _), text in zip(columns, x_texts, strict=True):
+        for column, text in zip(columns, x_texts, strict=True):
             drawing.words((column, bottom + 9), text)
-        widest = max(map(len, y_texts), default=0)
         if x:
             drawing.words(((left + right) / 2, bottom + 21), x, size)
         if y:
-            drawing.words((left - 13 - LETTER * SMALL * widest, (top + bottom) / 2), y, size, turned_deg=-90)
+            widest = LETTER * SMALL * max(map(len, y_texts), default=0)
+            drawing.words((left - 13 - widest, (top + bottom) / 2), y, size, turned_deg=-90)
 
     def _ticks(self, axis: str, most: float) -> Ticks:
-        low, high = sorted(self.x if axis == "x" else self.y)
+        low, high = sorted(getattr(self, axis))
         return log_ticks(low, high) if axis in self.log else ticks(low, high, int(np.clip(most, 3, 8)))
 
 

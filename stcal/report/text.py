@@ -1,11 +1,11 @@
 """Tables, numbers and poses as text."""
 
-import io
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from rich.cells import cell_len
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
@@ -13,7 +13,6 @@ from stcal.io.rotations import fixed
 
 NONE = "–"
 WIDTH = 100  # largest number of characters of a line of sentences
-WIDEST = 10_000  # largest number of characters of a line: no line is ever wrapped, whatever the terminal
 
 
 def number(value: float | None, digits: int) -> str:
@@ -51,20 +50,15 @@ def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: in
     """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped. ``rows`` :
     cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of each column;
     ``gap`` : between columns, in characters."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     heads, *body = rows
-    shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, gap, 0, 0))
+    table, columns = [[head.removeprefix("<") for head in heads], *body], []
     for k, head in enumerate(heads):
-        justification = "left" if head.startswith("<") else "right"
-        shown.add_column(justify=justification, no_wrap=True, min_width=least[k] if least else None)
-    for row in [[head.removeprefix("<") for head in heads], *body]:
-        shown.add_row(*(Text(cell) for cell in row))
-    stream = io.StringIO()
-    Console(file=stream, width=WIDEST, color_system=None, legacy_windows=False).print(shown, crop=False)
-    return [line.rstrip() for line in stream.getvalue().splitlines()]
+        cells = [row[k] for row in table]
+        width = max(least[k] if least else 0, *map(cell_len, cells))
+        room = [" " * (width - cell_len(cell)) for cell in cells]
+        pairs = zip(cells, room, strict=True) if head.startswith("<") else zip(room, cells, strict=True)
+        columns.append(map("".join, pairs))
+    return [(" " * gap).join(cells).rstrip() for cells in zip(*columns, strict=True)]
 
 
 HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")

@@ -3,7 +3,6 @@
 
 import tempfile
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -28,19 +27,17 @@ app = typer.Typer()
 @app.command()
 def init(folder: Annotated[Path, "Write the two files to this folder.", Arg()]) -> None:
     """Write target.toml and board.toml of the reference design, with comments, to edit."""
-    from stcal.boards.board_file import save_board
-    from stcal.boards.target_file import save_target
-    from stcal.design import reference_board, reference_target
+    from stcal import design
+    from stcal.boards import board_file, target_file
 
     folder.mkdir(parents=True, exist_ok=True)
     target, board = folder / "target.toml", folder / "board.toml"
     for path in (target, board):
         if path.exists():
             raise InputError("E-OUTPUT-EXISTS", f"{path}: exists; move it away, or give another folder")
-    save_target(target, reference_target())
-    save_board(board, reference_board())
-    say(target)
-    say(board)
+    target_file.save_target(target, design.reference_target())
+    board_file.save_board(board, design.reference_board())
+    say(f"{target}\n{board}")
 
 
 @app.command()
@@ -85,22 +82,12 @@ def simulate(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.forecast import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces
-    from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
+    from stcal.synthetic import body_scene
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
     from stcal.synthetic.scene import SceneOptions, make_scene
 
-    options = SceneOptions(
-        seed=seed,
-        width=width,
-        height=round(width * 2 / 3),
-        distance_mm=distance,
-        spread_deg=spread,
-        images_per_group=images,
-        margin_mm=margin,
-        one_board=one_board,
-        body_seed=body_seed,
-    )
+    model = None if camera is None else read_camera(camera)
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := target_of(target)).with_faces(printed=True).faces:
         names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
@@ -108,13 +95,14 @@ def simulate(
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
             fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
             raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
-        shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1, body_seed=body_seed)
-        file = None if camera is None else read_camera(camera)
-        if file is not None and not (file.width and file.height):
+        if model is not None and not (model.width and model.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
-        held = make_body_scene(body, body_camera(width) if file is None else file.calibrated(0, 0), shape)
+        with_camera = body_scene.body_camera(width) if model is None else model.calibrated(0, 0)
+        errors: dict[str, Any] = {"noise": noise, "blur_px": blur, "print_errors": 1, "body_seed": body_seed}
+        printed = body_scene.BodyOptions(images, distance, seed=seed, **errors)
+        held = body_scene.make_body_scene(body, with_camera, printed)
         with StageProgress() as progress:
-            paths = write_body(folder, held, kind, workers=workers, progress=partial(progress, "render"))
+            paths = body_scene.write_body(folder, held, kind, workers=workers, progress=partial(progress, "render"))
         say(f"{len(paths)} images: {folder}")
         print_each("note", filter(None, [held.hardly_seen()]))
         return
@@ -123,19 +111,19 @@ def simulate(
     one_given = (target is None) != (board is None)  # both are the reference's if neither is given
     with shared.designs_told(target, board, with_target=one_given, with_board=one_given):
         designs = _designs(target, board, second_design)
-        poses = nominal_poses(designs[0], None)
-        if groups:
-            options = replace(options, groups=pairs_of_faces(groups, designs[0]))
+        poses, pairs = nominal_poses(designs[0], None), pairs_of_faces(groups, designs[0]) if groups else None
         if camera is not None and fisheye is not None:
             raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
-        model = None if camera is None else read_camera(camera)
-        scene = make_scene(replace(options, fisheye_deg=fisheye), *designs, poses, model)
+        shape: dict[str, Any] = {"distance_mm": distance, "spread_deg": spread, "margin_mm": margin, "groups": pairs}
+        shape |= {"width": width, "height": round(width * 2 / 3), "fisheye_deg": fisheye, "images_per_group": images}
+        options = SceneOptions(seed=seed, one_board=one_board, body_seed=body_seed, **shape)
+        scene = make_scene(options, *designs, poses, model)
     lens = None
     if f_number is not None:
         lens = _lens(scene, f_number, distance if focus is None else focus, focal, camera)
-    elif unused := {name: mm for name, mm in {"--focus-mm": focus, "--focal-mm": focal}.items() if mm is not None}:
-        name, mm = next(iter(unused.items()))
-        raise InputError("E-OPTION-NEEDS", f"{name} {mm:g}: only with a thin lens; add --f-number")
+    for name, mm in {"--focus-mm": focus, "--focal-mm": focal}.items():
+        if mm is not None and f_number is None:
+            raise InputError("E-OPTION-NEEDS", f"{name} {mm:g}: only with a thin lens; add --f-number")
     look: dict[str, Any] = {"noise": noise, "blur_px": blur, "clutter": clutter, "reflectance": reflectance}
     depth = 16 if sixteen_bit else 8
     rendering = RenderOptions(bit_depth=depth, seed=seed, lens=lens, rim_mm=rim, slope=slope, **look)
@@ -283,35 +271,34 @@ def design(
     dodecahedron of tags. Forecast its σ."""
     from stcal.drawing.draw import net_text
     from stcal.io.cameras.read import read_camera
+    from stcal.sfm import make
     from stcal.sfm.detect.face_patterns import likeness_notes
-    from stcal.sfm.make import DesignOptions, design_tag_body, design_target, faces_of, made_text, size_of
     from stcal.sfm.planning.session import PlanOptions, plan_text
-    from stcal.synthetic.designs import made_text as body_text
-    from stcal.synthetic.designs import width_of
+    from stcal.synthetic import designs
 
-    of_circles = {"--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
-    of_tags = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
-    if tags is not None and (unfit := [name for name, given in of_circles.items() if given]):
-        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
-    if tags is None and (unfit := [name for name, given in of_tags.items() if given]):
-        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of tags, and there are none without --tags; add it")
+    unfit = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
+    why = "of tags, and there are none without --tags; add it"
+    if tags is not None:
+        unfit = {"--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
+        why = "of circles, not of --tags; leave it out"
+    if given := [name for name, value in unfit.items() if value]:
+        raise InputError("E-OPTION-CONFLICT", f"{given[0]}: {why}")
     model = read_camera(camera) if camera else None
     if tags is not None:
         session = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
-        made = design_tag_body(tags, width_of(size), dictionary, first_id, session, folder, faces)
+        made = make.design_tag_body(tags, designs.width_of(size), dictionary, first_id, session, folder, faces)
     else:
-        polarity = "bright" if bright else "dark"
-        sides, names = size_of(size), faces_of(faces)
-        options = DesignOptions(sides, circles, radius, distance, width, model, polarity, seed, names)
+        shape = circles, radius, distance, width, model, "bright" if bright else "dark", seed
+        options = make.DesignOptions(make.size_of(size), *shape, make.faces_of(faces))
         with StageProgress() as progress:
-            made = design_target(options, images, folder, progress)
+            made = make.design_target(options, images, folder, progress)
     if made.made is not None:
         print_each("note", likeness_notes(made.target))
-        say(made_text(made.made))
+        say(make.made_text(made.made))
         if made.board is not None:
             say(f"board: {shared.board_in_words(made.board)}")
     elif made.forecast is not None:
-        say(body_text(made.target, made.forecast.setup.camera, distance))
+        say(designs.made_text(made.target, made.forecast.setup.camera, distance))
     if tags is not None:
         say(net_text(made.target))
     for path in made.files:

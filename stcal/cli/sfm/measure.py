@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -47,13 +47,9 @@ def plan(
     out: shared.JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, without Monte Carlo, and say what would help most."""
-    from stcal.boards.board_file import load_dots
-    from stcal.boards.target_file import target_of
+    from stcal.boards import board_file, target_file
     from stcal.io.cameras.read import read_camera
-    from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
-    from stcal.sfm.planning.forecast import CentreNoise
-    from stcal.sfm.planning.session import PlanFile, PlanOptions, pairs_of_faces, plan_text
-    from stcal.sfm.planning.session import plan as planned
+    from stcal.sfm.planning import advise, session
     from stcal.sfm.runs.run_options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
@@ -63,28 +59,28 @@ def plan(
 
     target, board = of_run(target, "target.toml"), of_run(board, "board.toml")
     camera = of_run(camera, "cameras.txt") if width is None else camera
-    design = target_of(target)
+    design = target_file.target_of(target)
     if noise is not None and run is not None:
         raise InputError("E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both state σ; give one of them")
     if noise is not None:
-        centre_noise = CentreNoise(0.0, floor_px=noise, corner_px=noise)
+        centre_noise = session.CentreNoise(0.0, floor_px=noise, corner_px=noise)
         source = "--noise, whatever the size of a circle"
     elif run is not None:
         saved = load_run(run)
-        centre_noise, source = noise_of_run(saved), f"by size and tilt as in {run}"
-        if failures := failures_of(saved):
+        centre_noise, source = advise.noise_of_run(saved), f"by size and tilt as in {run}"
+        if failures := advise.failures_of(saved):
             print_each("warning", [f"{failures}: the σ of its centres have in them what failed"])
     else:
-        centre_noise, source = expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
+        centre_noise, source = advise.expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
         source = f"{source} (--noise, --run)"
-    model, pairs = read_camera(camera) if camera else None, pairs_of_faces(groups, design) if groups else None
+    model, pairs = read_camera(camera) if camera else None, session.pairs_of_faces(groups, design) if groups else None
     how = centre_noise, one_board, RunOptions(refine_camera=refine_camera), seed, margin
-    options = PlanOptions(images, spread, distance, width or 5184, model, pairs, *how)
+    options = session.PlanOptions(images, spread, distance, width or 5184, model, pairs, *how)
     with shared.designs_told(target, board):
-        result = planned(options, design, load_dots(board) if board else None, faces)
+        result = session.plan(options, design, board_file.load_dots(board) if board else None, faces)
     with printed_last():
-        say(plan_text(result, source))
-        write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
+        say(session.plan_text(result, source))
+        write_if(out, lambda: session.PlanFile.of_plan(result), "as JSON")
 
 
 @app.command()
@@ -95,19 +91,17 @@ def advise(
 ) -> None:
     """Compute which further photographs would lower the σ of the worst face of a run most."""
     shared.load_ahead(None)
-    from stcal.sfm.planning.advise import AdviceFile, advice_text, doubts, known_of
-    from stcal.sfm.planning.advise import advise as advice_for
+    from stcal.sfm.planning import advise
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
-    if doubt := doubts(saved):
-        print_each("warning", [doubt])
-    geometry = known_of(saved)
+    print_each("warning", filter(None, [advise.doubts(saved)]))
+    geometry = advise.known_of(saved)
     with StageProgress() as progress:
-        advice = advice_for(geometry, count, progress)
+        advice = advise.advise(geometry, count, progress)
     with printed_last():
-        say(advice_text(advice))
-        write_if(out, lambda: AdviceFile.of_advice(advice), "as JSON")
+        say(advise.advice_text(advice))
+        write_if(out, lambda: advise.AdviceFile.of_advice(advice), "as JSON")
 
 
 @app.command(name="calibrate-camera")
@@ -131,31 +125,30 @@ def calibrate_camera(
 ) -> None:
     """Calibrate the camera from views of the board, without start values, and write cameras.txt with σ and
     correlations."""
-    from stcal.boards.board_file import board_of, load_flat_board
-    from stcal.boards.target_file import target_of
+    from stcal.boards import board_file, target_file
     from stcal.design import BoardDesign
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.read import save_camera
     from stcal.io.device import images_or_frames
-    from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
-    from stcal.sfm.camera.camera_report import calibration_file, calibration_report
+    from stcal.sfm.camera import calibrate, camera_report
     from stcal.workflows.board_views import calibrate_camera_by_corners
 
     json_file = json_file or out.with_suffix(".json")
     shared.require_new([("--out", out), *([("--json", json_file)] if json_file != STANDARD_OUTPUT else [])])
-    target_design = target_of(target, printed=False)
-    board_design = board_of(None) if board is None else load_flat_board(board)
+    target_design = target_file.target_of(target, printed=False)
+    board_design = board_file.board_of(None) if board is None else board_file.load_flat_board(board)
     dots = isinstance(board_design, BoardDesign)
     told = shared.designs_told(target, board, with_target=dots and board is None)
     with told, images_or_frames(images) as folder, StageProgress() as progress:
         if isinstance(board_design, BoardDesign):
-            result = calibrate(folder, target_design, board_design, model, workers=workers, progress=progress)
+            how: dict[str, Any] = {"workers": workers, "progress": progress}
+            result = calibrate.calibrate_camera(folder, target_design, board_design, model, **how)
         else:
             result = calibrate_camera_by_corners(folder, board_design, model, workers, progress)
     intrinsics = result.intrinsics
     save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
-    summary = calibration_file(result)
-    document = calibration_report(result, summary, str(images))
+    summary = camera_report.calibration_file(result)
+    document = camera_report.calibration_report(result, summary, str(images))
     with printed_last():
         say(document.text())
         print_each("warning", result.warnings)
@@ -227,8 +220,7 @@ def measure(
             remedy = "for the pose in each picture of a video give --live --json -, or give the folder of its frames"
             raise InputError("E-IMAGES-FOLDER", f"{images}: a file, and no image; {remedy}")
         shared.load_ahead(detection.workers)
-    from stcal.boards.board_file import load_dots
-    from stcal.boards.target_file import target_of
+    from stcal.boards import board_file, target_file
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import read_table
     from stcal.sfm.adjust.faces_file import read_target
@@ -239,28 +231,25 @@ def measure(
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    design = target_of(target)
-    circles = read_target(faces, design)
+    design = target_file.target_of(target)
+    circles, dots = read_target(faces, design), board_file.load_dots(board) if board else None
+    posing = PoseOptions(sigma_factor=sigma_factor)
     if serve or live:
         # A path has one slash where the URL of a stream has two.
         url = re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(images))
         source = None if serve else camera_index if images is None else url
         model = read_camera(camera)
         model = replace(model, source=Path(model.source).name)  # answers name no folder of this machine
-        others = load_dots(board) if board else None, PoseOptions(sigma_factor=sigma_factor), ellipses
+        setting = replace(circles, design=design), model, dots, posing, ellipses
         limits = {"token": token, "max_megabytes": max_megabytes}
-        _serve((replace(circles, design=design), model, *others), source, host, port, limits, json_file is not None)
+        _serve(setting, source, host, port, limits, json_file is not None)
         return
     assert images is not None  # else it was refused above
     table = read_table(joints, "joints") if joints else None
-    options = work.MeasureOptions(
-        PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, detection.workers
-    )
+    options = work.MeasureOptions(posing, previous, sequence, ellipses, detection.workers)
     told = shared.designs_told(target, board, with_board=False)
     with told, detection.handed_over(), StageProgress() as progress:
-        result = work.measure(
-            images, read_camera(camera), circles, design, load_dots(board) if board else None, options, progress
-        )
+        result = work.measure(images, read_camera(camera), circles, design, dots, options, progress)
     text, apart = output.poses_csv(result, table)
     document = output.measure_report(result, str(images), every=verbose())
     with printed_last():

@@ -7,7 +7,7 @@ both agree."""
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -171,8 +171,7 @@ def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = (
     used = [each for each in budget.sources if each.key not in without]
     variances = [float(measurand.covariance(each, 0.0)[0, 0]) for each in used]
     estimated = sum(variance for each, variance in zip(used, variances, strict=True) if each.evaluation == "A")
-    length = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
-    return length, sum(variances), estimated**2 / budget.freedom
+    return measurand.length_mm * (1 + budget.conditions.correction), sum(variances), estimated**2 / budget.freedom
 
 
 def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLength:
@@ -224,7 +223,9 @@ class Uncertainty(Part):
     degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
 
     @classmethod
-    def of(cls, row: Row, unit: float) -> "Uncertainty":
+    def of(cls, row: Row) -> "Uncertainty":
+        """Returns the uncertainty of a position or distance in µm, of a rotation or angle in mdeg."""
+        unit = MICRO if row.measurand.kind in ("position", "distance") else MILLIDEGREES
         return cls(
             axes=(unit * np.sqrt(np.diag(row.covariance))).tolist(),
             contributions={key: unit * contribution for key, contribution in row.contributions.items()},
@@ -351,29 +352,35 @@ class BudgetFile(ResultFile):
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
         conditions, known = budget.conditions, budget.conditions.size_known
         answer, refused = answer_of(run), is_refused(run)
-        enlarged, poses, faces = 1 + conditions.correction, run.faces.poses(), {}
-        for position, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
-            pose = poses[position.measurand.name]
-            faces[position.measurand.name] = FaceUncertainty(
-                position_mm=(enlarged * pose.translation).tolist() if known else None,
-                rotation_vector_deg=pose.as_scipy().as_rotvec(degrees=True).tolist(),
-                position_um=Uncertainty.of(position, MICRO) if known else None,
-                rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
-            )
-        angles, distances = [], []
-        for row in budget.of_kind("angle"):
-            a, b = (poses[face].rotation[:, 2] for face in row.measurand.faces)
-            angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-            own: dict[str, Any] = {"angle_deg": angle_deg, "angle_mdeg": Uncertainty.of(row, MILLIDEGREES)}
-            angles.append(AngleUncertainty(faces=list(row.measurand.faces), **own))
-        for row in budget.of_kind("distance"):
-            length = row.measurand.length_mm or 0.0
-            own = {"length_mm": length, "corrected_mm": length * enlarged, "distance_um": Uncertainty.of(row, MICRO)}
-            distances.append(DistanceUncertainty(circles=list(row.measurand.circles), **own))
-        circles, variance = {}, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
+        rows = [] if refused else [(row.measurand, Uncertainty.of(row)) for row in budget.rows]
+        position_um = {measurand.of: own for measurand, own in rows if measurand.kind == "position" and known}
+        enlarged, poses, faces, angles, distances, circles = (
+            1 + conditions.correction,
+            run.faces.poses(),
+            {},
+            [],
+            [],
+            {},
+        )
+        for measurand, own in rows:
+            if measurand.kind == "rotation":
+                pose = poses[measurand.name]
+                faces[measurand.name] = FaceUncertainty(
+                    position_mm=(enlarged * pose.translation).tolist() if known else None,
+                    rotation_vector_deg=pose.as_scipy().as_rotvec(degrees=True).tolist(),
+                    position_um=position_um.get(measurand.of),
+                    rotation_mdeg=own,
+                )
+            elif measurand.kind == "angle":
+                a, b = (poses[face].rotation[:, 2] for face in measurand.of)
+                angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+                angles.append(AngleUncertainty(faces=list(measurand.of), angle_deg=angle_deg, angle_mdeg=own))
+            elif measurand.kind == "distance" and known:
+                lengths = {"length_mm": measurand.length_mm, "corrected_mm": measurand.length_mm * enlarged}
+                distances.append(DistanceUncertainty(circles=list(measurand.of), **lengths, distance_um=own))
+        variance = np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
         for label, own, freedom in zip(budget.joint.labels, variance, budget.circles_freedom, strict=True):
-            xyz = enlarged * np.asarray(run.faces.circles[label])
-            sigma_um = (MICRO * np.sqrt(own)).tolist()
+            xyz, sigma_um = enlarged * np.asarray(run.faces.circles[label]), (MICRO * np.sqrt(own)).tolist()
             circles[str(label)] = CircleUncertainty(xyz.tolist(), sigma_um, combine.coverage_factor(freedom))
         if any(is_refused(each) for each in (run, *others)):  # no U holds: nothing is judged
             bare = ([replace(own, expanded_um=None, e_n=None) for own in test.lengths] for test in tests)
@@ -409,9 +416,9 @@ class BudgetFile(ResultFile):
             stated=list(_stated(budget.statement, run)),
             definitions=_definitions(run),
             correction_ppm=PPM * conditions.correction if known else None,
-            faces={} if refused else faces,
-            angles=[] if refused else angles,
-            distances=[] if refused or not known else distances,
+            faces=faces,
+            angles=angles,
+            distances=distances,
             circles={} if refused or not known else circles,
             length_tests=TypeAdapter(list[LengthTest]).validate_python([asdict(test) for test in tests]),
             notes=notes_of(budget, verified, run),

@@ -2,7 +2,7 @@
 uncertainties of faces and of the target's largest distances."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date, time
 from itertools import combinations, combinations_with_replacement, product
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from pydantic import BeforeValidator, Field
 from scipy.linalg import null_space
+from scipy.spatial.distance import cdist
 from scipy.special import ndtr, stdtrit
 
 from stcal.boards.board_designs import TAG_SIGMA_MM
@@ -86,9 +87,9 @@ def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping
     sizes: dict[str, StatedSize] = {}
     origin: dict[tuple[str, str], str] = {}
     for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
-        values, default = asdict(second), asdict(first)
-        sizes[body] = StatedSize(**{key: default[key] if own is None else own for key, own in values.items()})
-        origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
+        values = {key: value for key, value in asdict(second).items() if value is not None}
+        sizes[body] = replace(first, **values)
+        origin |= {(body, key): str(path) if key in values else "board.toml" for key in asdict(first)}
     for name, value in (given or {}).items():
         if not name or len(name) > 60 or len(value) > LONGEST_TEXT:
             fault = f"--field {name[:20]}: {len(f'{name}={value}')} characters"
@@ -339,16 +340,18 @@ class Measurand:
     between two circles. The uncertainty of three numbers is the root of the summed variances."""
 
     kind: Kind
-    name: str  # the face, or ``a – b`` of two faces or circles
-    circles: tuple[CircleLabel, ...]
-    length_mm: float | None  # of a distance, else None
+    of: tuple[str, ...]  # the face, two faces, or two circles
     jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
     designed: np.ndarray  # (r, d) by the frame circles that were not mapped
-    faces: tuple[str, ...] = ()  # of an angle
+    length_mm: float = 0.0  # of a distance
 
     def __post_init__(self):
-        freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
-        freeze(self, "designed", (None, None), f"{self.name}: designed")
+        for name in ("jacobian", "designed"):
+            freeze(self, name, (None, None), f"{self.name}: {name}")
+
+    @property
+    def name(self) -> str:
+        return " – ".join(self.of)
 
     def covariance(self, source: BudgetSource, designed_sigma_mm: float) -> np.ndarray:
         """Covariance (r, r) from one source; ``designed_sigma_mm`` matters only for the source of placed circles."""
@@ -385,6 +388,11 @@ class GroupViews:
     group: str
     images: int
     spread_deg: float
+
+    @classmethod
+    def of(cls, model: MetricModel) -> "GroupViews":
+        spread_rad = widest_angle_rad(np.array([pose.rotation[2] for pose in model.camera_from_model]))
+        return cls(model.group, len(model.images), float(np.degrees(spread_rad)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -445,7 +453,7 @@ def budget(
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
     every = measurands(joint, own, reference_face)
     rows = tuple(_row(measurand, sources, own.designed_sigma_mm, freedom, rng) for measurand in every)
-    views = tuple(_view(model) for model in joint.models)
+    views = tuple(GroupViews.of(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
         for kinds in ("AB", "A")
@@ -461,7 +469,7 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
     other_faces = [face for face in own.target_from_face if face != reference_face]
     rows_of: dict[Kind, slice] = {"position": slice(3, 6), "rotation": slice(0, 3)}
     poses = [
-        Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
+        Measurand(kind, (face,), own.faces[face][rows], own.face_designed[face][rows])
         for (kind, rows), face in product(rows_of.items(), other_faces)
     ]
     angles = [_angle(own, a, b) for a, b in combinations(own.target_from_face, 2)]
@@ -475,17 +483,17 @@ def _angle(own: Derivatives, a: str, b: str) -> Measurand:
     about = np.cross(first, second)[None]
     about = about / np.linalg.norm(about) if np.linalg.norm(about) > PARALLEL else null_space(first[None]).T
     jacobian, designed = (about @ (by[b][:3] - by[a][:3]) for by in (own.faces, own.face_designed))
-    return Measurand("angle", f"{a} – {b}", (), None, jacobian, designed, (a, b))
+    return Measurand("angle", (a, b), jacobian, designed)
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
     """Returns, for every two faces and within each, the two circles farthest apart, the longest distance first."""
     faces = {face: rows.tolist() for face, rows in rows_by(label.face for label in labels).items()}
-    pairs = []
+    apart, pairs = cdist(xyz, xyz), []
     for a, b in combinations_with_replacement(faces, 2):
         ends = combinations(faces[a], 2) if a == b else product(faces[a], faces[b])
-        pairs += sorted(ends, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))[:1]
-    return sorted(pairs, key=lambda pair: -float(np.linalg.norm(xyz[pair[0]] - xyz[pair[1]])))
+        pairs += sorted(ends, key=lambda pair: -apart[pair])[:1]
+    return sorted(pairs, key=lambda pair: -apart[pair])
 
 
 def distance(joint: JointResult, i: int, j: int) -> Measurand:
@@ -495,7 +503,7 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     jacobian = np.zeros(joint.xyz_model.shape)
     jacobian[j], jacobian[i] = difference / length, -difference / length
     ends = joint.labels[i], joint.labels[j]
-    return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian.reshape(1, -1), np.zeros((1, 0)))
+    return Measurand("distance", ends, jacobian.reshape(1, -1), np.zeros((1, 0)), length)
 
 
 def _row(measurand: Measurand, sources: Sequence[BudgetSource], sigma_mm: float, freedom: int, rng: Generator) -> Row:
@@ -513,8 +521,3 @@ def _row(measurand: Measurand, sources: Sequence[BudgetSource], sigma_mm: float,
     coverage = float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean())
     contributions = {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()}
     return Row(measurand, contributions, covariance, standard, expanded, coverage, effective)
-
-
-def _view(model: MetricModel) -> GroupViews:
-    spread_rad = widest_angle_rad(np.array([pose.rotation[2] for pose in model.camera_from_model]))
-    return GroupViews(model.group, len(model.images), float(np.degrees(spread_rad)))

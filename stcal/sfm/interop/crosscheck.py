@@ -33,18 +33,7 @@ from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.runs.comparisons import (
-    CameraRow,
-    Crosscheck,
-    FaceDifference,
-    FacesCompared,
-    ImagesRegistered,
-    MappingCompared,
-    ResidualRms,
-    ResultCompared,
-    Tolerances,
-    allowed_text,
-)
+from stcal.sfm.runs.comparisons import CameraRow, Crosscheck, FaceDifference, MappingCompared, Tolerances, allowed_text
 from stcal.sfm.runs.folder import require_report, write_report
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 from stcal.sfm.runs.transaction import AGAIN, added_results
@@ -325,30 +314,28 @@ def _compared(
         again = on_luminous_surface(again, heights, rim_sigma_mm, run.target_design, options.frame)
     native_images, own_images = ({name for m in of.models for name in m.images} for of in (of_native, of_pycolmap))
     only = {"only_native": sorted(native_images - own_images), "only_pycolmap": sorted(own_images - native_images)}
-    images = ImagesRegistered(native=len(native_images), pycolmap=len(own_images), run=len(run.observations), **only)
-    ours = of_pycolmap.target
-    between = _targets(of_native.target, ours.target_from_face, ours.circles, run)
-    mapping = between.model_copy(update={"cameras": _cameras(of_native, of_pycolmap, run)})
-    result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
-    if not run.faces.target_from_face_covariance:
-        tolerances = tolerances.without_sigma()
     of_native_px, of_pycolmap_px = (
         rms(np.concatenate([model.residuals_px(run.camera) for model in of.models])) for of in (of_native, of_pycolmap)
     )
-    of_run_px = run.report["summary"]["residual_rms_px"]
-    return Crosscheck(
+    between = _targets(of_native.target, of_pycolmap.target.target_from_face, of_pycolmap.target.circles, run)
+    sections: dict[str, Any] = {
+        "images": {"native": len(native_images), "pycolmap": len(own_images), "run": len(run.observations)} | only,
+        "residual_rms_px": {"native": of_native_px, "pycolmap": of_pycolmap_px}
+        | {"run": run.report["summary"]["residual_rms_px"]},
+        "mapping": between.model_copy(update={"cameras": _cameras(of_native, of_pycolmap, run)}),
+        "result": _targets(again.target, run.faces.poses(), run.faces.circles, run),
+        "plain": {"faces": face_differences(of_native.target, run)},
+    }
+    check = Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
         schema=schema.name,
-        tolerances=tolerances,
-        images=images,
-        residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
-        mapping=mapping,
-        result=result,
-        plain=FacesCompared(faces=face_differences(of_native.target, run)),
+        tolerances=tolerances if run.faces.target_from_face_covariance else tolerances.without_sigma(),
         notes=list(of_native.notes),
-        differences=_differences(images, mapping, result, tolerances),
+        differences=[],
+        **sections,
     )
+    return check.model_copy(update={"differences": _differences(check)})
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
@@ -407,9 +394,8 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
     um: dict[str, float] = {label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()}
-    known = {label: v for label, v in off.items() if label in covariances}
-    floor = FACE_FLOOR[3:]
-    sigmas: dict[str, float] = {label: _sigmas(v, covariances[label], floor) for label, v in known.items()}
+    known = {label: covariances[label] for label in off if label in covariances}
+    sigmas: dict[str, float] = {label: _sigmas(off[label], c, FACE_FLOOR[3:]) for label, c in known.items()}
     return MappingCompared(faces=face_differences(target, run, faces), circles_um=um, circles_sigmas=sigmas)
 
 
@@ -484,9 +470,8 @@ def comparison_text(check: Crosscheck) -> str:
     return "\n".join([*check.notes, *lines])
 
 
-def _differences(
-    images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, limits: Tolerances
-) -> list[str]:
+def _differences(check: Crosscheck) -> list[str]:
+    images, mapping, result, limits = check.images, check.mapping, check.result, check.tolerances
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:

@@ -75,12 +75,12 @@ class Content:
                 frames.append(Static(self.face_frame(face), self.circle_frame(label), face_from_circle))
         return frames
 
-    def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns σ of a face's rotation, rad, and position, mm, about and along the target's axes, or None."""
+    def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns σ of a face's position, µm, and rotation, mdeg, in the target's axes; empty if not known."""
         if face not in self.target.face_covariance:
-            return None
-        sigma = np.sqrt(np.maximum(np.diag(self.target.face_covariance[face]), 0))  # the reference's is 0 but rounded
-        return sigma[:3], sigma[3:]
+            return np.zeros(0), np.zeros(0)
+        sigma = 1e3 * np.sqrt(np.maximum(np.diag(self.target.face_covariance[face]), 0))  # the reference's may be −0
+        return sigma[3:], np.degrees(sigma[:3])
 
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
@@ -95,9 +95,7 @@ class Content:
         if not self.target.face_covariance:
             return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
         for face in faces.target_from_face:
-            turn, shift = self.face_sigma(face) or (np.zeros(3), np.zeros(3))
-            um = " ".join(number(1e3 * v, 2) for v in shift)
-            mdeg = " ".join(number(1e3 * v, 3) for v in np.degrees(turn))
+            um, mdeg = (" ".join(number(v, 2 + k) for v in own) for k, own in enumerate(self.face_sigma(face)))
             text = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
             lines.append(f"face {face}: {text}")
         return lines
@@ -153,8 +151,7 @@ def table(content: Content) -> str:
     for face, pose in content.target.target_from_face.items():
         x, y, z, w = xyzw(pose)
         turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
-        turn, shift = content.face_sigma(face) or (np.zeros(0), np.zeros(0))
-        cells = [f"{v:.4g}" for v in (*(1e3 * shift), *(1e3 * np.degrees(turn)))]
+        cells = [f"{v:.4g}" for v in np.concatenate(content.face_sigma(face))]
         rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *(cells or [""] * 6)])
         for label in content.circles_of(face):
             covariance = content.target.circle_covariance.get(label)
@@ -167,10 +164,9 @@ def table(content: Content) -> str:
 def opencv(content: Content) -> str:
     """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
     covariances of circles."""
-    lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
-    lines += [f"reference_face: {_quoted(content.run.faces.reference_face)}"]
-    lines += [f"said: {_list(content.said())}", "faces:"]
     target, radius = content.target, content.run.faces.radius_mm
+    lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
+    lines += [f"reference_face: {_quoted(target.reference_face)}", f"said: {_list(content.said())}", "faces:"]
     for face, pose in target.target_from_face.items():
         labels = content.circles_of(face)
         covariances = [target.circle_covariance[label] for label in labels if label in target.circle_covariance]
@@ -271,41 +267,38 @@ POINTS = 96  # of the ball that shows σ
 Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion x y z w that turns the target's Z to glTF's Y, which points up
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
 """Rotation from OpenCV's to glTF's camera axes. glTF's cameras look along −Z, with Y up."""
+PARTS = ("nodes", "meshes", "materials", "accessors", "bufferViews")
 UNLIT = "KHR_materials_unlit"
 
 
 @dataclass(slots=True, eq=False)
 class _Scene:
-    """Parts of a glTF file, to which shapes, meshes and nodes are added."""
+    """Parts of a glTF file by kind, in the order in which they are written, and its buffer."""
 
     data: bytearray = field(default_factory=bytearray)
-    views: list[dict] = field(default_factory=list)
-    accessors: list[dict] = field(default_factory=list)
-    meshes: list[dict] = field(default_factory=list)
-    nodes: list[dict] = field(default_factory=list)
+    parts: dict[str, list[dict]] = field(default_factory=lambda: {kind: [] for kind in PARTS})
+
+    def add(self, kind: str, **own) -> int:
+        """Adds a part without its empty lists, and returns its number."""
+        self.parts[kind].append({key: value for key, value in own.items() if value != []})
+        return len(self.parts[kind]) - 1
 
     def shape(self, points: np.ndarray, indices: np.ndarray) -> dict:
         """Adds points (n, 3), m, and the indices of lines or triangles between them."""
-        place = len(self.accessors)
-        ends = {"min": points.astype("<f4").min(axis=0).tolist(), "max": points.astype("<f4").max(axis=0).tolist()}
+        points, indices = points.astype("<f4"), indices.ravel().astype("<u4")
+        numbers, ends = [], {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
         for raw, target, component, kind, more in (
-            (points.astype("<f4"), VERTICES, FLOAT, "VEC3", ends),
-            (indices.ravel().astype("<u4"), INDICES, UNSIGNED, "SCALAR", {}),
+            (points, VERTICES, FLOAT, "VEC3", ends),
+            (indices, INDICES, UNSIGNED, "SCALAR", {}),
         ):
-            accessor = {"bufferView": len(self.views), "componentType": component, "count": len(raw), "type": kind}
-            self.accessors.append(accessor | more)
-            view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": raw.nbytes, "target": target}
-            self.views.append(view)
+            view = self.add("bufferViews", buffer=0, byteOffset=len(self.data), byteLength=raw.nbytes, target=target)
+            accessor = {"bufferView": view, "componentType": component, "count": len(raw), "type": kind}
+            numbers.append(self.add("accessors", **accessor, **more))
             self.data += raw.tobytes()
-        return {"attributes": {"POSITION": place}, "indices": place + 1}
+        return {"attributes": {"POSITION": numbers[0]}, "indices": numbers[1]}
 
     def mesh(self, name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
-        self.meshes.append({"name": name, "primitives": [shape | {"material": colour, "mode": mode}]})
-        return len(self.meshes) - 1
-
-    def node(self, **own) -> int:
-        self.nodes.append({key: value for key, value in own.items() if value != []})
-        return len(self.nodes) - 1
+        return self.add("meshes", name=name, primitives=[shape | {"material": colour, "mode": mode}])
 
 
 def gltf(content: Content) -> str:
@@ -335,37 +328,37 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         circles = []
         for label in content.circles_of(face):
             radius_mm, covariance = content.run.faces.radius_mm[label], target.circle_covariance.get(label)
-            children = [scene.node(name=str(label), mesh=own, scale=[MM_M * radius_mm, MM_M * radius_mm, 1.0])]
+            children = [scene.add("nodes", name=str(label), mesh=own, scale=[MM_M * radius_mm, MM_M * radius_mm, 1.0])]
             extras = {"label": str(label), "xyz_mm": target.circles[label].tolist(), "radius_mm": radius_mm}
             if covariance is not None:
                 ellipsoid = _ellipsoid(covariance, pose, factor)
-                children.append(scene.node(name=f"sigma of {label}, times {factor:g}", **ellipsoid, mesh=grey))
+                children.append(scene.add("nodes", name=f"sigma of {label}, times {factor:g}", **ellipsoid, mesh=grey))
                 extras["covariance_mm2"] = covariance.tolist()
             name, at = content.circle_frame(label), (MM_M * content.xyz_face(label)).tolist()
-            circles.append(scene.node(name=name, translation=at, children=children, extras=extras))
+            circles.append(scene.add("nodes", name=name, translation=at, children=children, extras=extras))
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
         if face in target.face_covariance:
             extras["covariance_rad_mm"] = target.face_covariance[face].tolist()
         placed = {"translation": metres(pose), "rotation": xyzw(pose)}
-        below.append(scene.node(name=content.face_frame(face), **placed, children=circles, extras=extras))
+        below.append(scene.add("nodes", name=content.face_frame(face), **placed, children=circles, extras=extras))
     below += _cameras(content, scene) if content.photographs else []
     extras = {"said": content.said(), "sigma_drawn_times": factor}
-    up = scene.node(name="y_up", rotation=Y_UP, children=[scene.node(name=content.root, children=below, extras=extras)])
-    materials = []
+    up = scene.add(
+        "nodes",
+        name="y_up",
+        rotation=Y_UP,
+        children=[scene.add("nodes", name=content.root, children=below, extras=extras)],
+    )
     for colour in (*(rgb[face] for face in target.target_from_face), (40, 40, 40), BOARD_RGB):
         linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in colour]
         surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
-        materials.append({"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}})
+        scene.add("materials", pbrMetallicRoughness=surface, doubleSided=True, extensions={UNLIT: {}})
     tree = {
         "asset": {"version": "2.0", "generator": content.said()[0]},
         "extensionsUsed": [UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [up]}],
-        "nodes": scene.nodes,
-        "meshes": scene.meshes,
-        "materials": materials,
-        "accessors": scene.accessors,
-        "bufferViews": scene.views,
+        **scene.parts,
         **({"cameras": [_lens(content.camera)]} if content.photographs else {}),
     }
     return tree, bytes(scene.data)
@@ -385,7 +378,7 @@ def _cameras(content: Content, scene: _Scene) -> list[int]:
         turned = xyzw(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
         placed = {"translation": metres(pose), "rotation": turned}
         extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
-        nodes.append(scene.node(name=name, camera=0, mesh=frustum, **placed, extras=extras))
+        nodes.append(scene.add("nodes", name=name, camera=0, mesh=frustum, **placed, extras=extras))
     return nodes
 
 

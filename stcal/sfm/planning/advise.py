@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations, compress, product
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -43,6 +43,7 @@ from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, SceneOptions
 
 REACH_DEG = 50.0  # largest distance of candidates from the middle of a group's views, in azimuth and in elevation
 GRID_DEG = 10.0  # step of the grid of candidates, in azimuth and in elevation
+Turns = tuple[float, float, float]  # azimuth, elevation and roll, degrees
 ROLLS_DEG = (0.0, 90.0)  # of the camera; 90° separates intrinsics from poses, and is tried if intrinsics are refined
 
 
@@ -50,7 +51,6 @@ ROLLS_DEG = (0.0, 90.0)  # of the camera; 90° separates intrinsics from poses, 
 class PlannedView:
     """A photograph to take in a group, at angles about its middle that count from the ``middle`` photograph."""
 
-    group: str
     model: MetricModel  # of this one image
     azimuth_deg: float
     elevation_deg: float
@@ -62,12 +62,26 @@ class PlannedView:
     nearest_deg: float
 
     @property
+    def group(self) -> str:
+        return self.model.group
+
+    @property
     def camera_from_target(self) -> Rigid:
         return self.model.camera_from_model[0]
 
     @property
     def labels(self) -> list[Label]:
         return [self.model.labels[i] for i in self.model.point_index]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class KnownRun(Brief):
+    """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
+
+    models: tuple[MetricModel, ...]
+    setup: Setup
+    noise: CentreNoise
+    scene: Scene
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +110,34 @@ class _Stand:
         rotation = look_along(-direction[None], up, np.array([-np.radians(roll_deg)]))[0]
         return Rigid(rotation, -rotation @ (self.centre + self.distance_mm * direction))
 
+    def view(
+        self, known: KnownRun, model, pose: Rigid, labels: list[Label], place: Turns, planes, middle: int
+    ) -> PlannedView:
+        """Returns the photograph that shows these points of a group, with the σ that they will have. ``place`` :
+        azimuth, elevation and roll, counted from the image ``middle``; ``planes`` : normal and middle by name."""
+        points, n, camera = np.array([model.labels.index(label) for label in labels]), len(labels), known.setup.camera
+        image = replace(
+            model,
+            images=(f"{model.group}/view {place} from {model.images[middle]}",),
+            camera_from_model=(pose,),
+            image_index=np.zeros(n, int),
+            point_index=points,
+            keypoint=np.arange(n),
+            measured_px=camera.project(pose @ model.xyz_model[points]),
+            shift_px=np.zeros((n, 2)),
+            covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+        )
+        cosine = self.directions @ (pose.inverse().translation - self.centre) / self.distance_mm
+        tilts = {plane: tilt_deg(normal, at, pose) for plane, (normal, at) in planes.items()}
+        nearest, nearest_deg = model.images[int(cosine.argmax())], angle_deg(cosine.max())
+        noisy = known.noise.applied(image, camera, known.setup.radius_mm())
+        return PlannedView(noisy, *place, self.distance_mm, tilts, model.images[middle], nearest, nearest_deg)
+
+
+def tilt_deg(normal: np.ndarray, middle: np.ndarray, camera_from_target: Rigid) -> float:
+    ray = camera_from_target.inverse().translation - middle
+    return angle_deg(normal @ ray / np.linalg.norm(ray))
+
 
 def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
     """Returns the axes (3, 3) rows right, up, towards the camera, as a photograph shows right and up."""
@@ -122,20 +164,19 @@ def known_scene(joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
     return Scene(target, setup.board, camera, setup.start.target_from_face, circles, groups, seed=0)
 
 
-def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+def candidates(known: KnownRun, model: MetricModel) -> list[PlannedView]:
     """Returns the views, on a grid about the present ones, that show the whole board and at least one whole face."""
     stand, steps = _Stand.of(model), np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG).tolist()
-    rolls = ROLLS_DEG[: 1 if setup.prior is None else None]
+    rolls = ROLLS_DEG[: 1 if known.setup.prior is None else None]
     places = [(azimuth, elevation, roll) for roll, elevation, azimuth in product(rolls, steps, steps)]
     poses = []
     for *angles, roll in places:
         (x, y), (right, ahead) = np.sin(np.radians(angles)), np.cos(np.radians(angles))
         poses.append(stand.pose(np.array([ahead * x, y, ahead * right]) @ stand.axes, stand.axes[1], roll))
-    group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
-    scene = replace(scene, groups={model.group: group})
-    board = group.target_from_board.rotation
-    planes = {BOARD: (-board[:, 2], scene.board_outline(model.group).mean(0))}  # outward normal, and middle
-    for face in (face.id for face in scene.target.faces):
+    group = replace(known.scene.groups[model.group], camera_from_target=tuple(poses))
+    scene = replace(known.scene, groups={model.group: group})
+    planes = {BOARD: (-group.target_from_board.rotation[:, 2], scene.board_outline(model.group).mean(0))}
+    for face in (face.id for face in scene.target.faces):  # outward normal, and middle
         planes[face] = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
     normals = np.array([planes.get(label.plane, planes[BOARD])[0] for label in model.labels])
     centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
@@ -147,64 +188,28 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     for i, place in enumerate(places):
         labels = set(model.labels) & shown(scene, model.group, i, limit)
         if members[BOARD] <= labels and any(own <= labels for key, own in members.items() if key != BOARD):
-            position = poses[i].inverse().translation
-            seen = [BOARD, *sorted({label.plane for label in labels} - {BOARD})]
-            tilts = {plane: tilt_deg(*planes[plane], position) for plane in seen}
-            cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
-            own = single(model, f"view {place}", poses[i], sorted(labels), setup, noise)
-            nearest = model.images[stand.middle], model.images[int(cosine.argmax())], angle_deg(cosine.max())
-            views.append(PlannedView(model.group, own, *place, stand.distance_mm, tilts, *nearest))
+            seen = {plane: planes[plane] for plane in [BOARD, *sorted({label.plane for label in labels} - {BOARD})]}
+            views.append(stand.view(known, model, poses[i], sorted(labels), place, seen, stand.middle))
     return views
 
 
 def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]:
     """Returns the labels of the group's circles that a view shows whole, not too oblique and not hidden by a plate."""
     circles = image_circles(scene, group, image)
-    camera_from_target = scene.groups[group].camera_from_target[image]
     plates = [scene.face_outline(face.id) for face in scene.target.faces] + [scene.board_outline(group)]
-    hidden = _behind(circles.xyz_camera, camera_from_target @ np.stack(plates)).any(0)
-    visible = circles.must_find & (circles.tilt_rad <= max_tilt_rad) & ~hidden
-    return {label for label, is_visible in zip(circles.labels, visible, strict=True) if is_visible}
-
-
-def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
-    """Returns whether rectangles (m, 4, 3) are between the camera and points (n, 3); (m, n)."""
-    origin, a, b = corners_camera[:, 0], corners_camera[:, 1], corners_camera[:, 3]
-    a, b = a - origin, b - origin
-    normal = np.cross(a, b)
-    with np.errstate(divide="ignore", invalid="ignore"):  # lines of sight parallel to the plane never meet it
-        depth_ratio = (origin * normal).sum(1)[:, None] / (normal @ xyz_camera.T)
-        from_corner = depth_ratio[..., None] * xyz_camera - origin[:, None]
-        u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in (a, b))
-        return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
-
-
-def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> float:
-    ray = position - middle
-    return angle_deg(normal @ ray / np.linalg.norm(ray))
+    origin, a, _, b = np.moveaxis(scene.groups[group].camera_from_target[image] @ np.stack(plates), 1, 0)  # corners
+    sides, normal = (a - origin, b - origin), np.cross(a - origin, b - origin)
+    with np.errstate(divide="ignore", invalid="ignore"):  # lines of sight parallel to a plate never meet it
+        depth_ratio = (origin * normal).sum(1)[:, None] / (normal @ circles.xyz_camera.T)
+        from_corner = depth_ratio[..., None] * circles.xyz_camera - origin[:, None]
+        u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in sides)
+        hides = (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
+    visible = circles.must_find & (circles.tilt_rad <= max_tilt_rad) & ~hides.any(0)
+    return set(compress(circles.labels, visible.tolist()))
 
 
 def angle_deg(cosine: ArrayLike) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def single(
-    model: MetricModel, name: str, pose: Rigid, labels: list[Label], setup: Setup, noise: CentreNoise
-) -> MetricModel:
-    """Returns the model of one image of the group that shows these points, with the σ that they will have."""
-    points, n = np.array([model.labels.index(label) for label in labels]), len(labels)
-    image = replace(
-        model,
-        images=(f"{model.group}/{name}",),
-        camera_from_model=(pose,),
-        image_index=np.zeros(n, int),
-        point_index=points,
-        keypoint=np.arange(n),
-        measured_px=setup.camera.project(pose @ model.xyz_model[points]),
-        shift_px=np.zeros((n, 2)),
-        covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
-    )
-    return noise.applied(image, setup.camera, setup.radius_mm())
 
 
 LEAST_COSINE = -0.2  # smallest cosine of the angle between two faces that one view is to show
@@ -212,31 +217,28 @@ MAX_TILT_DEG = 60.0  # largest tilt of a face whose corners count as seen
 SHARES = (0.35, 0.5, 0.65)  # where candidates stand between the normals of two faces
 
 
-def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+def body_views(known: KnownRun, model: MetricModel) -> list[PlannedView]:
     """Returns candidates, each with two faces that one view can show, as a motion from the nearest photograph."""
-    poses, stand = setup.start.target_from_face, _Stand.of(model)
-    faces = [face for face in setup.target.faces if face.id in poses]
-    normals = {face.id: face.outward * poses[face.id].rotation[:, 2] for face in faces}
-    middles = {face.id: poses[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
+    poses, stand = known.setup.start.target_from_face, _Stand.of(model)
+    planes = {  # outward normal, and middle
+        face.id: (face.outward * poses[face.id].rotation[:, 2], poses[face.id] @ np.append(face.xy_mm.mean(0), 0.0))
+        for face in known.setup.target.faces
+        if face.id in poses
+    }
     views = []
-    for (one, two), share, roll in product(combinations(normals, 2), SHARES, ROLLS_DEG):
-        if normals[one] @ normals[two] < LEAST_COSINE:
+    for (one, two), share, roll in product(combinations(planes, 2), SHARES, ROLLS_DEG):
+        if planes[one][0] @ planes[two][0] < LEAST_COSINE:
             continue
-        direction = share * normals[one] + (1 - share) * normals[two]
+        direction = share * planes[one][0] + (1 - share) * planes[two][0]
         direction /= np.linalg.norm(direction)
-        cosine = stand.directions @ direction
-        near = int(cosine.argmax())
+        near = int((stand.directions @ direction).argmax())
         axes = axes_of(model.camera_from_model[near], stand.directions[near])
         right, up, ahead = (axes @ direction).tolist()
         azimuth, elevation = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
-        position = stand.centre + stand.distance_mm * direction
-        tilts = {face: tilt_deg(normals[face], middles[face], position) for face in sorted(normals)}
-        tilts = {face: tilt for face, tilt in tilts.items() if tilt < MAX_TILT_DEG}
-        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in tilts]
         pose = stand.pose(direction, axes[1], roll)
-        own = single(model, f"view {one} {two} {share} {roll}", pose, labels, setup, noise)
-        nearest = model.images[near], model.images[near], angle_deg(cosine[near])
-        views.append(PlannedView(model.group, own, azimuth, elevation, roll, stand.distance_mm, tilts, *nearest))
+        seen = {face: planes[face] for face in sorted(planes) if tilt_deg(*planes[face], pose) < MAX_TILT_DEG}
+        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in seen]
+        views.append(stand.view(known, model, pose, labels, (azimuth, elevation, roll), seen, near))
     return views
 
 
@@ -270,7 +272,6 @@ class Advice(Brief):
 
     now: Forecast  # of the run as it is
     shares: dict[str, dict[str, float]]  # of its variance, by face and source
-    noise: CentreNoise
     choices: tuple[AdvisedView, ...]  # each chosen in addition to those before it
     new_groups: tuple[NewGroup, ...]  # the best first
     better_board: Forecast  # with half the board's σ
@@ -280,16 +281,6 @@ class Advice(Brief):
     def board_dominates(self) -> bool:
         """Whether most of the worst face's variance is the board's, so that more views help little."""
         return self.shares[self.now.worst()[0]].get("board", 0.0) > BOARD_DOMINATES
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class KnownRun(Brief):
-    """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
-
-    models: tuple[MetricModel, ...]
-    setup: Setup
-    noise: CentreNoise
-    scene: Scene
 
 
 def known_of(run: SavedRun) -> KnownRun:
@@ -354,16 +345,15 @@ def advise(known: KnownRun | AnyRun, count: int = 5, progress: Progress | None =
     now = forecast(models, setup)
     with kept_processes():
         if setup.board.rows:
-            jobs = [(known.scene, model, setup, known.noise) for model in models]
-            by_group = run_in_order(candidates, jobs, 1)
+            by_group = run_in_order(candidates, [(known, model) for model in models], 1)
         else:
-            by_group = [body_views(model, setup, known.noise) for model in models]
+            by_group = [body_views(known, model) for model in models]
         views = [view for views_of_group in by_group for view in views_of_group]
         chosen = tuple(_greedy(known, views, now, count, progress or (lambda *_: None)))
     new_groups = tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))) if setup.board.rows else ()
     better = forecast(models, setup.better_board(0.5), now.derivatives)
     shares = variance_shares(now, models, setup)
-    return Advice(now, shares, known.noise, chosen, new_groups, better, len(views))
+    return Advice(now, shares, chosen, new_groups, better, len(views))
 
 
 def _greedy(

@@ -14,7 +14,6 @@ from scipy.stats import t as student
 
 from stcal.boards.board_file import board_toml, load_board
 from stcal.design import KnownDistance, ScaleReference, StatedSize
-from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
@@ -31,7 +30,7 @@ from stcal.sfm.budget.combine import FIELDS, Statement, budget_of_run, condition
 from stcal.sfm.report.check import CHECKS
 from stcal.sfm.runs.saved import adjusted_run
 from stcal.sfm.runs.transaction import MarkerFile, verify
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, refuses
 from tests.shared import own_copy, unsealed_copy
 
 STATEMENT = """
@@ -90,6 +89,9 @@ def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
 
 
 def test_contributions_add_up_as_squares(saved, plain):
+    """The board of the run has the default of 0.005 mm, which nobody has measured."""
+    (dots,) = (row for row in plain.sources if row.key == "board_dots")
+    assert (dots.origin, "the default" in dots.words) == ("assumed", True)
     assert len(plain.rows) == 3 + 3 + 6 + 5
     for face in BudgetFile.of(plain, saved, verify(saved.folder)).faces.values():
         for written in (face.position_um, face.rotation_mdeg):
@@ -137,18 +139,13 @@ def test_one_thermometer_of_both_errs_in_the_difference_of_the_expansions(saved,
     alike = budget_of_run(saved, replace(stated, board=board, target=target, one_thermometer=True))
     for row in alike.of_kind("distance"):
         assert row.contributions["temperature"] / row.measurand.length_mm < 0.1e-6  # of 23 ppm each
-    (source,) = (each for each in alike.sources if each.key == "temperature")
+    unstated = replace(stated, board=StatedSize(temperature_sigma_k=0.5), target=StatedSize(), one_thermometer=True)
+    source, open_source = (
+        next(each for each in found.sources if each.key == "temperature")
+        for found in (alike, budget_of_run(saved, unstated))
+    )
     assert (source.sigma, source.unit, source.origin) == (1.0, "K", "stated")
-
-
-def test_one_thermometer_is_stated_before_the_tables_and_a_date_of_toml_is_its_text(saved, tmp_path):
-    path = tmp_path / "lab.toml"
-    path.write_text("one_thermometer = true\n[board]\ntemperature_sigma_k = 0.5\n[fields]\ndate = 2026-11-27\n")
-    found = statement_of(StatedSize(), path)
-    assert (found.one_thermometer, found.fields["date"]) == (True, "2026-11-27")
-    (source,) = (each for each in budget_of_run(saved, found).sources if each.key == "temperature")
-    assert source.origin == "not stated"
-    assert source.words.count("expansion_ppm_per_k") == 2
+    assert (open_source.origin, open_source.words.count("expansion_ppm_per_k")) == ("not stated", 2)
 
 
 def test_rims_that_were_estimated_are_a_row(saved, plain):
@@ -167,13 +164,15 @@ def test_rims_that_were_estimated_are_a_row(saved, plain):
 
 def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     path = tmp_path / "lab.toml"
-    path.write_text("[board]\ntemperature_c = 24\n")
+    path.write_text("one_thermometer = true\n[board]\ntemperature_c = 24\n[fields]\ndate = 2026-11-27\n")
     own = StatedSize(expansion_ppm_per_k=8.0, temperature_c=30.0)
     found = statement_of(own, path, {"operator": "B", "serial": "12"})
+    assert found.one_thermometer
     assert (found.board.expansion_ppm_per_k, found.board.temperature_c) == (8.0, 24.0)
     assert found.origin["board", "temperature_c"] == str(path)
     assert found.origin["board", "expansion_ppm_per_k"] == "board.toml"
-    assert found.fields == dict.fromkeys(FIELDS, "") | {"operator": "B", "serial": "12"}
+    given = {"operator": "B", "serial": "12", "date": "2026-11-27"}  # a date of TOML is its text
+    assert found.fields == dict.fromkeys(FIELDS, "") | given
     conditions = conditions_of(found, saved.board_design)
     assert (conditions.correction, conditions.temperature_c) == (pytest.approx(32e-6), None)
 
@@ -230,10 +229,8 @@ def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path)
     for shown in (budget_report(file).text(), budget_report(file).page()):
         assert "only the shape is known" in shown.lower()
         assert not any(word in shown for word in ("Certificate", "hold at", "position of face", "longest distance"))
-    path = tmp_path / "lengths.csv"
-    path.write_text("from,to,length_mm\n1:1,1:2,100\n")
-    with fails_with("E-BUDGET-NO-SIZE"):
-        against_stated(shape, path)
+    (tmp_path / "lengths.csv").write_text("from,to,length_mm\n1:1,1:2,100\n")
+    refuses("E-BUDGET-NO-SIZE", against_stated, shape, tmp_path / "lengths.csv")
 
 
 def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
@@ -314,22 +311,19 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[board]\npitch_sigma_ppm = 30e-6\n", "30, and in % 0.3;"),
-        ("[board]\ntemperature_c = 295.65\n", "22.5 °C"),
-        ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
-        ("[target]\nexpansion_ppm_per_k = 0.000023\n", "2.3e-05 1/K is 23;"),
-        ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
-        ("[fields]\noperator = 3\n", "fields.operator: 3:"),
-        ("operator = 'x'\n", "operator: unknown key"),
-        ("[target]\none_thermometer = true\n", "move it to the top of the file"),
+        ("[board]\npitch_sigma_ppm = 30e-6", "E-KEY-VALUE … 30, and in % 0.3;"),
+        ("[board]\ntemperature_c = 295.65", "E-KEY-VALUE … 22.5 °C"),
+        ("[board]\npitch_sigma_ppm = -1", "E-KEY-VALUE … board.pitch_sigma_ppm: -1:"),
+        ("[target]\nexpansion_ppm_per_k = 0.000023", "E-KEY-VALUE … 2.3e-05 1/K is 23;"),
+        ("[target]\npitch_sigma_ppm = 1", "E-KEY-UNKNOWN … target.pitch_sigma_ppm"),
+        ("[fields]\noperator = 3", "E-KEY-VALUE … fields.operator: 3:"),
+        ("operator = 'x'", "E-KEY-UNKNOWN … operator"),
+        ("[target]\none_thermometer = true", "E-KEY-UNKNOWN … move it to the top of the file"),
     ],
 )
 def test_statements_that_are_none(tmp_path, content, words):
-    path = tmp_path / "lab.toml"
-    path.write_text(content)
-    with pytest.raises(StcalError) as error:
-        statement_of(StatedSize(), path)
-    assert words in str(error.value)
+    (tmp_path / "lab.toml").write_text(content)
+    refuses(words, statement_of, StatedSize(), tmp_path / "lab.toml")
 
 
 @pytest.mark.parametrize(
@@ -353,12 +347,6 @@ def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")
 
 
-def test_a_sigma_as_files_are_written_with_counts_as_assumed(plain):
-    """The board of the run has the default of 0.005 mm; nobody has measured it."""
-    (row,) = (row for row in plain.sources if row.key == "board_dots")
-    assert (row.origin, "the default" in row.words) == ("assumed", True)
-
-
 def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,length_mm,sigma_mm"):
     """Lengths of the run, each shorter by so many expanded uncertainties; degrees of freedom grow as the stated σ does
     (Welch–Satterthwaite)."""
@@ -366,7 +354,7 @@ def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,le
     for i, j in longest_of(plain.joint.labels, plain.joint.xyz_model)[:rows]:
         a, b = plain.joint.labels[i], plain.joint.labels[j]
         length = float(np.linalg.norm(plain.joint.xyz_model[i] - plain.joint.xyz_model[j]))
-        own = next(r for r in plain.of_kind("distance") if r.measurand.circles == (a, b))
+        own = next(r for r in plain.of_kind("distance") if r.measurand.of == (a, b))
         u = np.hypot(own.standard, sigma_mm)
         k = student.ppf(norm.cdf(2), own.freedom * (u / own.standard) ** 4)
         cells = [a, b, f"{length - off_u * k * u:.9f}", str(sigma_mm)]
@@ -389,13 +377,10 @@ def test_errors_over_their_uncertainty(plain, tmp_path, off_u, rows, beyond, agr
     assert "must state lengths for the temperature at which the target was photographed" in note
     at_20 = replace(plain, conditions=replace(plain.conditions, temperature_c=20.0))
     assert against_stated(at_20, tmp_path / "lengths.csv").notes == ()
-
-
-def test_lengths_without_sigma_are_exact(plain, tmp_path):
-    path = lengths_csv(tmp_path / "lengths.csv", plain, 0.9, sigma_mm=0.0, head="from,to,length_mm")
-    found = against_stated(plain, path)
-    assert [each.e_n for each in found.lengths] == pytest.approx([0.9] * 4, abs=1e-5)
-    assert "no sigma_mm" in found.notes[0]
+    exact = lengths_csv(tmp_path / "exact.csv", plain, off_u, rows, sigma_mm=0.0, head="from,to,length_mm")
+    without = against_stated(plain, exact)
+    assert [each.e_n for each in without.lengths] == pytest.approx([off_u] * rows, abs=1e-5)
+    assert "no sigma_mm" in without.notes[0]
 
 
 def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, plain, tmp_path):
@@ -405,7 +390,7 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
     assert alike.agrees
     assert "cannot be seen here" in alike.notes[0]
     longest = plain.of_kind("distance")[0]
-    assert alike.lengths[0].circles == longest.measurand.circles
+    assert alike.lengths[0].circles == longest.measurand.of
     assert alike.lengths[0].error_um == 0
     k = student.ppf(norm.cdf(2), 2 * longest.freedom)
     assert alike.lengths[0].expanded_um == pytest.approx(1e3 * k * np.sqrt(2) * longest.standard)
@@ -429,18 +414,15 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        ("1:1,9:9,100,0", "line 2: no circle 9:9"),
-        ("1:1,1:1,100,0", "line 2: 1:1 to 1:1"),
-        ("1:1,1:2,40,-1", "a σ of 0 or more"),
-        ("1:1,1:2,x,0", "length_mm is 'x'"),
+        ("1:1,9:9,100,0", "E-BUDGET-LENGTHS … line 2: no circle 9:9"),
+        ("1:1,1:1,100,0", "E-BUDGET-LENGTHS … line 2: 1:1 to 1:1"),
+        ("1:1,1:2,40,-1", "E-BUDGET-LENGTHS … a σ of 0 or more"),
+        ("1:1,1:2,x,0", "E-TABLE-NUMBER … length_mm is 'x'"),
     ],
 )
 def test_lengths_that_are_none(plain, tmp_path, row, words):
-    path = tmp_path / "lengths.csv"
-    path.write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
-    with pytest.raises(StcalError) as error:
-        against_stated(plain, path)
-    assert words in str(error.value)
+    (tmp_path / "lengths.csv").write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
+    refuses(words, against_stated, plain, tmp_path / "lengths.csv")
 
 
 def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
@@ -523,7 +505,7 @@ def test_an_angle_is_that_of_the_normals_and_its_uncertainty_what_draws_of_the_c
     for row in plain.of_kind("angle"):
         normals = [
             Rotation.from_rotvec((own.faces[face][:3] @ draws).T).apply(own.target_from_face[face].matrix()[:3, 2])
-            for face in row.measurand.faces
+            for face in row.measurand.of
         ]
         angles = np.arctan2(np.linalg.norm(np.cross(*normals), axis=1), np.sum(np.multiply(*normals), axis=1))
         assert np.std(angles) == pytest.approx(row.standard, rel=0.06)  # 4 σ of 2000 draws

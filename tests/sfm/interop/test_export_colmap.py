@@ -88,8 +88,21 @@ def colmap(monkeypatch):
     return call
 
 
+@pytest.fixture(scope="module")
+def databases(small_run, tmp_path_factory):
+    """Paths of the run's database in every form, by schema; the run's own one stays as it is."""
+    folder, before = tmp_path_factory.mktemp("databases"), state_of(small_run / "colmap")
+    for schema in SCHEMAS:
+        written = export_database(small_run, folder / f"{schema}.db", schema)
+        assert (written.images, written.pairs, written.camera_models) == (8, 28, ("OPENCV",))
+    assert state_of(small_run / "colmap") == before
+    paths = {path.stem: path for path in folder.iterdir()}
+    assert paths.keys() == SCHEMAS.keys()
+    return paths
+
+
 @pytest.mark.parametrize("schema", ["3.8", "4.2"])
-def test_the_schema_is_what_the_program_itself_makes(schema, small_run, tmp_path, colmap):
+def test_the_schema_is_what_the_program_itself_makes(schema, databases, tmp_path, colmap):
     """Against an empty database of native COLMAP 3.8 and of pycolmap 4.2, made here and now."""
     if schema == "4.2":
         pycolmap.Database.open(str(tmp_path / "empty.db")).close()
@@ -97,37 +110,30 @@ def test_the_schema_is_what_the_program_itself_makes(schema, small_run, tmp_path
         colmap("database_creator", "--database_path", tmp_path / "empty.db")
     else:
         pytest.skip("native colmap is not 3.8")
-    export_database(small_run, tmp_path / "out.db", schema)
-    assert described(tmp_path / "out.db") == described(tmp_path / "empty.db")
+    assert described(databases[schema]) == described(tmp_path / "empty.db")
 
 
-@pytest.mark.parametrize("schema", PUBLISHED, ids=[f"{schema} as published, not run here" for schema in PUBLISHED])
-def test_the_schema_is_the_published_one(schema, small_run, tmp_path):
+def test_schemas_are_the_published_ones(databases):
     """Against what was recorded when each version was run; the versions themselves are not here."""
-    export_database(small_run, tmp_path / "out.db", schema)
-    lines = described(tmp_path / "out.db")
-    assert hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16] == PUBLISHED[schema], "\n".join(lines)
+    lines = {schema: described(databases[schema]) for schema in PUBLISHED}
+    assert {name: hashlib.sha256("\n".join(own).encode()).hexdigest()[:16] for name, own in lines.items()} == PUBLISHED
 
 
-@pytest.mark.parametrize("schema", list(SCHEMAS)[::3])
-def test_everything_is_kept(schema, small_run, tmp_path):
+def test_everything_is_kept(databases, small_run):
     """Every row and value of the run's own database, its type and its place."""
-    own, before = small_run / "colmap/database.db", state_of(small_run / "colmap")
-    written = export_database(small_run, tmp_path / "out.db", schema)
-    assert (written.images, written.pairs, written.camera_models) == (8, 28, ("OPENCV",))
-    ours, theirs = columns_of(own), columns_of(tmp_path / "out.db")
-    for table, columns in theirs.items():
-        shared = [column for column in columns if column in ours[table]]
-        assert rows_of(tmp_path / "out.db", table, shared) == rows_of(own, table, shared)
-        for column in set(columns) - {*ours[table]}:
-            assert {row[0] for row in rows_of(tmp_path / "out.db", table, [column])} <= {None}
-    assert len(rows_of(tmp_path / "out.db", "keypoints", ["data"])) == 8
-    assert (tmp_path / "out.db").read_bytes()[18:20] == b"\1\1"  # rollback journal: one file is all of it
-    with read_only(tmp_path / "out.db") as opened:
-        assert opened.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-        assert opened.execute("PRAGMA foreign_key_check").fetchall() == []
-    assert state_of(small_run / "colmap") == before
-    assert [path.name for path in tmp_path.iterdir()] == ["out.db"]
+    own = small_run / "colmap/database.db"
+    ours = columns_of(own)
+    for path in databases.values():
+        for table, columns in columns_of(path).items():
+            shared = [column for column in columns if column in ours[table]]
+            assert rows_of(path, table, shared) == rows_of(own, table, shared)
+            for column in set(columns) - {*ours[table]}:
+                assert {row[0] for row in rows_of(path, table, [column])} <= {None}
+        assert len(rows_of(path, "keypoints", ["data"])) == 8
+        assert path.read_bytes()[18:20] == b"\1\1"  # rollback journal: one file is all of it
+        with read_only(path) as opened:
+            assert opened.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+            assert opened.execute("PRAGMA foreign_key_check").fetchall() == []
 
 
 def first_group(run) -> tuple[list[str], tuple[int, int]]:
@@ -154,15 +160,14 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
     }
 
 
-def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
+def test_pycolmap_makes_the_same_model_of_the_export(small_run, databases, tmp_path):
     """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
     names, pair = first_group(small_run)
     own = small_run / "colmap/database.db"
     ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
     assert len(ours) >= 80
     for schema in ("3.8", "3.13"):
-        export_database(small_run, tmp_path / f"{schema}.db", schema)
-        model = mapped(tmp_path / f"{schema}.db", tmp_path / schema, names, pair)
+        model = mapped(databases[schema], tmp_path / schema, names, pair)
         assert model.num_reg_images() == len(names)
         theirs = points_by_track(model)
         assert theirs.keys() == ours.keys()
@@ -184,17 +189,10 @@ def test_a_refused_export_writes_and_overwrites_nothing(saved, tmp_path):
 
 
 def test_a_file_that_appears_meanwhile_is_not_overwritten(saved, tmp_path, monkeypatch):
-    write = export.write_copy
-
-    def slow(*arguments):
-        (tmp_path / "out.db").write_text("theirs")
-        return write(*arguments)
-
-    monkeypatch.setattr(export, "write_copy", slow)
-    with fails_with("E-OUTPUT-EXISTS"):
-        export_database(saved, tmp_path / "out.db", "3.8")
-    assert (tmp_path / "out.db").read_text() == "theirs"
-    assert [p.name for p in tmp_path.iterdir()] == ["out.db"]
+    place = tmp_path / "out.db"
+    monkeypatch.setattr(export, "write_copy", lambda run, made, schema: made.touch() or place.write_text("theirs"))
+    refuses("E-OUTPUT-EXISTS", export_database, saved, place, "3.8")
+    assert {path: path.read_text() for path in tmp_path.iterdir()} == {place: "theirs"}
 
 
 AGAIN_PX = 5e-5

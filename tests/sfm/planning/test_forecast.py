@@ -223,7 +223,7 @@ def test_advised_views_do_what_is_said(known, advice):
 
 
 def offered(known):
-    return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
+    return [(model, candidates(known, model)) for model in known.models]
 
 
 @pytest.mark.slow
