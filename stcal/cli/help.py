@@ -112,7 +112,6 @@ class Commands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx, formatter) -> None:
-        """Writes the name and help of each command."""
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         shown = {name: command for name, command in commands.items() if command and not command.hidden}
         rows = {name: (name, " ".join((command.help or "").split())) for name, command in shown.items()}
@@ -169,7 +168,7 @@ FIRST_WEEK = {
     "sfm run": "out camera target board refine_camera board_only exclude every expect_faces verbose",
     "sfm detect": "camera out target board exclude min_diameter max_diameter workers verbose",
     "sfm simulate": "target board camera images width distance groups one_board png seed",
-    "sfm design": "size faces tags circles radius distance camera images bright",
+    "sfm design": "size faces tags circles radius_mm distance camera images bright",
     "sfm plan": "camera target board images distance groups faces run out one_board",
     "sfm measure": "camera faces out report board sequence joints live serve verbose",
     "sfm budget": "page pdf statement check_lengths lengths lengths_statement field out strict verbose",

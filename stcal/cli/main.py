@@ -78,12 +78,10 @@ def environment() -> dict[str, str]:
 
 
 def main() -> None:
-    """Entry point of ``stcal``."""
     _guarded(app)
 
 
 def main_sfm() -> None:
-    """Entry point of ``stcal-sfm``."""
     _guarded(sfm.app)
 
 

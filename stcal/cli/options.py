@@ -50,7 +50,10 @@ class Opt:
         return typer.Option(*names, help=text, min=self.min, max=self.max, **more)
 
 
-WRITES = Opt(writes=True)  # an option with the name of a file that is written
+MOST_SEED = 2**63 - 1
+"""Largest seed: other programs read seeds in result files as signed 64-bit integers."""
+WRITES, JSON, SEED = Opt(writes=True), Opt("--json", writes=True), Opt(min=0, max=MOST_SEED)
+WIDTH = Opt(min=320, max=100_000)  # of images, px
 
 
 class Arg(Opt):
@@ -91,9 +94,7 @@ Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--dis
 FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."]
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
-JsonFile = Annotated[
-    Path | None, "Also write all results to this file (JSON; `-`: standard output).", Opt("--json", writes=True)
-]
+JsonFile = Annotated[Path | None, "Also write all results to this file (JSON; `-`: standard output).", JSON]
 ReportFile = Annotated[Path | None, "Also write a page to this file (HTML).", Opt("--report", writes=True)]
 Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
 Gain = Annotated[float | None, "Set this gain, in the driver's unit; unchanged if not given.", Opt(min=0, max=1e6)]
@@ -110,8 +111,6 @@ ALWAYS_NEW = ("export_database", "export_run")
 WRITE_NOTHING = ("serve", "live", "dry_run")  # options with which no output is written
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command may replace existing outputs."""
-MOST_SEED = 2**63 - 1
-"""Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
 Scheduler = Annotated[str | None, "Send the images to the Dask scheduler at this address, tcp://host:8786."]
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]

@@ -55,7 +55,6 @@ def wait_for_others() -> None:
 
 
 def verbose() -> bool:
-    """Returns whether more than usual is to be printed."""
     return _verbose.get()
 
 
@@ -68,7 +67,6 @@ class _Beat(threading.Thread):
         self.stage, self.began = "working", time.perf_counter()
 
     def at(self, stage: str) -> None:
-        """Notes what the command is at."""
         if stage != self.stage:
             self.stage, self.began = stage, time.perf_counter()
 

@@ -73,7 +73,6 @@ def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def comparison_text(found: CameraDifference) -> list[str]:
-    """Return lines with the numbers of a comparison."""
     length = found.lengths()
     turn = np.degrees(found.second_from_first.log()[:3])
     rows, columns = length.shape

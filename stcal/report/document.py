@@ -129,7 +129,6 @@ class Notes(Printed):
     """Remarks: a list on the page, lines that begin with ``note:`` on the terminal."""
 
     def lines(self) -> list[str]:
-        """Return a line for each remark."""
         return [f"note: {text}" for text in self.content]
 
     def __html__(self) -> str:
@@ -156,7 +155,6 @@ TONES = {
 
 
 def tone_of(word: str) -> str:
-    """Return the tone in which a page has a verdict."""
     return next(tone for tone, words in TONES.items() if word in words)
 
 
@@ -175,7 +173,6 @@ class Cell:
 
 
 def verdict_word(word: str) -> Cell:
-    """Return the word of a verdict in its tone."""
     return Cell(word, ("verdict", tone_of(word)))
 
 

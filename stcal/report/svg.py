@@ -212,7 +212,6 @@ class Axes:
         self.drawing.lines([self.at(*line) for line in lines], colour, width, **look)
 
     def level(self, y: float, colour: str = INK, width: float = 0.7, dash: str = "") -> None:
-        """Draws a line across at a value."""
         self.lines([(self.x, (y, y))], colour, width, dash=dash)
 
     def marks(self, x, y, kind: str, size: float, colour: str, opacity: float = 1.0) -> None:

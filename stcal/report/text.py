@@ -5,7 +5,6 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from rich.cells import cell_len
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
@@ -50,6 +49,8 @@ def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: in
     """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped. ``rows`` :
     cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of each column;
     ``gap`` : between columns, in characters."""
+    from rich.cells import cell_len
+
     heads, *body = rows
     table, columns = [[head.removeprefix("<") for head in heads], *body], []
     for k, head in enumerate(heads):

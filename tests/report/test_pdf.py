@@ -29,7 +29,7 @@ def words(pdf: bytes, command: str = "pdftotext", *options: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
+def test_a_page_is_printed_on_a4_with_numbers_and_its_title_without_what_paper_cannot_do():
     pdf = pdf_of(page(110))
     text = words(pdf, "pdftotext", "-layout").split("\f")[:-1]
     assert "595.276 x 841.89 pts (A4)" in words(pdf, "pdfinfo")
@@ -38,14 +38,9 @@ def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
         foot = each.rstrip().splitlines()[-1].replace(" ", "")
         assert foot == f"The<target>{i}/{len(text)}"
     assert all("Name" in each for each in text[1:3])  # heads of a table again on each sheet
-
-
-@pytest.mark.slow
-def test_what_paper_cannot_do_is_not_printed():
-    text = words(pdf_of(page(3)))
-    assert "Hidden (folded: see the page on screen)" in text
-    for gone in ("folded away", "press me", "never shown", "Contents"):
-        assert gone not in text
+    assert "Hidden (folded: see the page on screen)" in "".join(text)
+    for gone in ("folded away", "press me", "never shown", "Contents"):  # what paper cannot do
+        assert gone not in "".join(text)
 
 
 def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):

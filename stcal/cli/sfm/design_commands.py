@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.options import MOST_SEED, WRITES, Arg, Opt
+from stcal.cli.options import SEED, WIDTH, WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, printed_last, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
@@ -51,16 +51,14 @@ def simulate(
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[float | None, "Use a thin lens of this f-number; else no blur.", Opt(min=0.5, max=100)] = None,
-    focus: Annotated[float | None, "Focus at this depth, or at --distance.", Opt("--focus-mm", min=10, max=1e7)] = None,
-    focal: Annotated[
-        float | None, "Set the focal length, or that of a sensor 22.3 mm wide.", Opt("--focal-mm", min=0.5, max=5000)
+    focus_mm: Annotated[float | None, "Focus at this depth, or at --distance.", Opt(min=10, max=1e7)] = None,
+    focal_mm: Annotated[
+        float | None, "Set the focal length, or that of a sensor 22.3 mm wide.", Opt(min=0.5, max=5000)
     ] = None,
-    rim: Annotated[float, "Set the height of rims; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)] = 0.0,
+    rim_mm: Annotated[float, "Set the height of rims; < 0: raised discs.", Opt(min=-20, max=20)] = 0.0,
     slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
-    reflectance: Annotated[
-        float | None, "Add a table of this reflectance.", Opt("--table-reflectance", min=0, max=1)
-    ] = None,
+    table_reflectance: Annotated[float | None, "Add a table of this reflectance.", Opt(min=0, max=1)] = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
     groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14; else all visible ones."] = None,
@@ -69,10 +67,8 @@ def simulate(
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
     png: Annotated[bool, "Write PNG instead of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
-    seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
-    body_seed: Annotated[
-        int | None, "Draw errors of target, camera and board with this, not --seed.", Opt(min=0, max=MOST_SEED)
-    ] = None,
+    seed: Annotated[int, "Draw all random numbers with this seed.", SEED] = 0,
+    body_seed: Annotated[int | None, "Draw errors of target, camera and board with this, not --seed.", SEED] = None,
     margin: shared.PlateMargin = 15.0,
     workers: shared.Workers = None,
 ) -> None:
@@ -91,7 +87,7 @@ def simulate(
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := target_of(target)).with_faces(printed=True).faces:
         names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
-        others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
+        others = groups, fisheye, f_number, rim_mm, board, slope, second_design, one_board, clutter, sixteen_bit
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
             fault = f"{unfit[0]}: not for a body with boards or tags on its faces"
             raise InputError("E-OPTION-CONFLICT", f"{fault}; leave it out")
@@ -120,13 +116,13 @@ def simulate(
         scene = make_scene(options, *designs, poses, model)
     lens = None
     if f_number is not None:
-        lens = _lens(scene, f_number, distance if focus is None else focus, focal, camera)
-    for name, mm in {"--focus-mm": focus, "--focal-mm": focal}.items():
+        lens = _lens(scene, f_number, distance if focus_mm is None else focus_mm, focal_mm, camera)
+    for name, mm in {"--focus-mm": focus_mm, "--focal-mm": focal_mm}.items():
         if mm is not None and f_number is None:
             raise InputError("E-OPTION-NEEDS", f"{name} {mm:g}: only with a thin lens; add --f-number")
-    look: dict[str, Any] = {"noise": noise, "blur_px": blur, "clutter": clutter, "reflectance": reflectance}
+    look: dict[str, Any] = {"noise": noise, "blur_px": blur, "clutter": clutter, "reflectance": table_reflectance}
     depth = 16 if sixteen_bit else 8
-    rendering = RenderOptions(bit_depth=depth, seed=seed, lens=lens, rim_mm=rim, slope=slope, **look)
+    rendering = RenderOptions(bit_depth=depth, seed=seed, lens=lens, rim_mm=rim_mm, slope=slope, **look)
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
@@ -216,6 +212,7 @@ def demo(
     say(comparison_table(comparison))
 
 
+Body = Literal["cube", "dodecahedron"]
 CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"  # defaults of `design`
 
 
@@ -228,7 +225,7 @@ def draw(
         "Print on as many sheets of this paper as needed: A5 … A0, Letter, Legal or Tabloid. With own, a page is as "
         "large as its content. If not given, A4 for .pdf and own for the others.",
     ] = "",
-    margin: Annotated[float, "Add this margin around the circles, mm.", Opt("--margin-mm", min=0, max=1e4)] = 10.0,
+    margin_mm: Annotated[float, "Add this margin around the circles, mm.", Opt(min=0, max=1e4)] = 10.0,
     net: Annotated[bool, "Draw a target's plates as one net to fold, using outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
@@ -239,16 +236,14 @@ def draw(
 
     if isinstance(target := load_design(design), TargetDesign):
         print_each("note", likeness_notes(target))
-    say(drawn_text(drawn(design, out, paper, margin, net)))
+    say(drawn_text(drawn(design, out, paper, margin_mm, net)))
 
 
 @app.command()
 def design(
     folder: Annotated[Path, "Write target.toml to this folder, and board.toml if there is none.", Arg()],
     size: Annotated[str, "Make it for a box of W,H,D mm; for --tags, give the width between opposite faces."],
-    tags: Annotated[
-        Literal["cube", "dodecahedron"] | None, "Make this body with a tag on each face and no board."
-    ] = None,
+    tags: Annotated[Body | None, "Make this body with a tag on each face and no board."] = None,
     dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
     first_id: Annotated[int, "Number the tags of --tags from this id.", Opt(min=0, max=100_000)] = 0,
     faces: Annotated[
@@ -257,15 +252,15 @@ def design(
         "is the reference face. With --tags, place tags on these faces alone, by number: 1,2,3,4,5.",
     ] = "",
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
-    radius: Annotated[
-        float | None, "Draw the smaller circles with this radius; else chosen.", Opt("--radius-mm", min=0.01, max=1e4)
+    radius_mm: Annotated[
+        float | None, "Draw the smaller circles with this radius; else chosen.", Opt(min=0.01, max=1e4)
     ] = None,
     distance: shared.Distance = 1000.0,
-    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
+    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", WIDTH] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     bright: Annotated[bool, "Make bright circles on dark plates, or dark on bright.", Opt("--bright/--dark")] = False,
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
-    seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, "Draw all random numbers with this seed.", SEED] = 0,
 ) -> None:
     """Make a target for a box, with circles that identify each face even if any three are hidden; or make a cube or
     dodecahedron of tags. Forecast its σ."""
@@ -279,7 +274,7 @@ def design(
     unfit = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
     why = "of tags, and there are none without --tags; add it"
     if tags is not None:
-        unfit = {"--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
+        unfit = {"--circles": circles != CIRCLES, "--radius-mm": radius_mm, "--bright": bright}
         why = "of circles, not of --tags; leave it out"
     if given := [name for name, value in unfit.items() if value]:
         raise InputError("E-OPTION-CONFLICT", f"{given[0]}: {why}")
@@ -288,7 +283,7 @@ def design(
         session = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
         made = make.design_tag_body(tags, designs.width_of(size), dictionary, first_id, session, folder, faces)
     else:
-        shape = circles, radius, distance, width, model, "bright" if bright else "dark", seed
+        shape = circles, radius_mm, distance, width, model, "bright" if bright else "dark", seed
         options = make.DesignOptions(make.size_of(size), *shape, make.faces_of(faces))
         with StageProgress() as progress:
             made = make.design_target(options, images, folder, progress)

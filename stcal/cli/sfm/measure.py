@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.options import WRITES, Arg, Opt
+from stcal.cli.options import JSON, SEED, WIDTH, WRITES, Arg, Opt
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, printed_last, say, verbose, write, write_if
 from stcal.errors import InputError
 
@@ -27,9 +27,7 @@ def plan(
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     distance: shared.Distance = 1000.0,
     width: Annotated[
-        int | None,
-        "Take images of this width, px, 3:2, with a 24 mm lens; 5184 if not given.",
-        Opt(min=320, max=100_000),
+        int | None, "Take images of this width, px, 3:2, with a 24 mm lens; 5184 if not given.", WIDTH
     ] = None,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
@@ -42,7 +40,7 @@ def plan(
     groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14 or front-right,front-top."] = None,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     one_board: Annotated[bool, "Use one plate in all groups, not one each.", Opt("--one-board/--own-boards")] = True,
-    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    seed: Annotated[int, "Place board and cameras at random with this seed.", SEED] = 0,
     margin: shared.PlateMargin = 15.0,
     out: shared.JsonFile = None,
 ) -> None:
@@ -116,9 +114,7 @@ def calibrate_camera(
         "for wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE or THIN_PRISM_FISHEYE. `auto` takes "
         "the simplest model that predicts held-out views as well as the best one.",
     ] = "OPENCV",
-    json_file: Annotated[
-        Path | None, "Write figures and checks here (JSON), or beside --out.", Opt("--json", writes=True)
-    ] = None,
+    json_file: Annotated[Path | None, "Write figures and checks here (JSON), or beside --out.", JSON] = None,
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
     workers: shared.Workers = None,

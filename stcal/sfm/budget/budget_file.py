@@ -212,8 +212,6 @@ class SourceRow(Part):
 
 
 class Uncertainty(Part):
-    """Uncertainty of one measurand."""
-
     axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
     contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
     standard: float = Field(description="combined standard uncertainty of all of them together")
@@ -237,7 +235,6 @@ class Uncertainty(Part):
         )
 
     def share(self, key: str) -> float:
-        """Returns the share of one source in the variance."""
         return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
 
 

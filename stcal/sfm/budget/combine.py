@@ -411,7 +411,6 @@ class Budget:
     conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
 
     def of_kind(self, kind: Kind) -> list[Row]:
-        """Returns the rows of one kind."""
         return [row for row in self.rows if row.measurand.kind == kind]
 
 
@@ -497,7 +496,6 @@ def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int
 
 
 def distance(joint: JointResult, i: int, j: int) -> Measurand:
-    """Returns the measurand of the distance between two circles."""
     difference = joint.xyz_model[j] - joint.xyz_model[i]
     length = float(np.linalg.norm(difference))
     jacobian = np.zeros(joint.xyz_model.shape)

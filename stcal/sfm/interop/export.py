@@ -58,7 +58,6 @@ class Content:
         return self.target.target_from_face[label.face].inverse() @ self.target.circles[label]
 
     def face_frame(self, face: str) -> str:
-        """Returns the name of the frame of a face."""
         return f"{self.root}_{face}"
 
     def circle_frame(self, label: CircleLabel) -> str:

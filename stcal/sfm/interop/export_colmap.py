@@ -299,6 +299,5 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Seque
 
 
 def model_text(written: ExportedModel) -> str:
-    """Returns a text on the contents of the model."""
     counts = f"{written.images} images and {written.points} points"
     return f"{counts}; mm, target frame: {written.path}\nlabels: {written.labels}"

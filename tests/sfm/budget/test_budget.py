@@ -246,11 +246,14 @@ def test_the_longest_distances_are_of_different_pairs_of_faces():
     assert longest_of(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
 
 
-def test_command(stcal_sfm, small_run, tmp_path):
-    path, out = tmp_path / "lab.toml", tmp_path / "budget.json"
+def test_command(stcal_sfm, small_run, tmp_path, monkeypatch):
+    """Terminal, JSON, page and PDF say the same. Fields are text in the page, not markup."""
+    monkeypatch.setattr(pdf, "pdf_of", lambda page: b"%PDF-" + page[:15].encode())
+    path, page, out = (tmp_path / name for name in ("lab.toml", "budget.html", "budget.json"))
     path.write_text(STATEMENT)
-    words = "--statement", path, "--field", "instrument=X 5"
-    code, text, _ = stcal_sfm("budget", small_run, *words, "-v", "--json", out)
+    words = ("--statement", path, "--field", "instrument=X 5", "--field", "customer=<b>A & B</b>")
+    written = ("--lengths", small_run, "--report", page, "--pdf", "--json", out)
+    code, text, _ = stcal_sfm("budget", small_run, *words, *written, "-v")
     assert code == 0
     assert all(shown in text for shown in ("performed by: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
     file = json.loads(out.read_text())
@@ -262,13 +265,27 @@ def test_command(stcal_sfm, small_run, tmp_path):
     first = file["distances"][0]
     assert first["corrected_mm"] == pytest.approx(first["length_mm"] * (1 - 14e-6), abs=1e-9)
     assert first["distance_um"]["contributions"]["board_pitch"] == pytest.approx(10e-3 * first["length_mm"], rel=2e-3)
-    pose = np.array(json.loads((small_run / "faces.json").read_text())["target_from_face"]["5"])
+    faces = json.loads((small_run / "faces.json").read_text())
+    pose = np.array(faces["target_from_face"]["5"])
     assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)
     turn = Rotation.from_rotvec(file["faces"]["5"]["rotation_vector_deg"], degrees=True)
     assert np.allclose(turn.as_matrix(), pose[:3, :3], atol=1e-9)
     assert (file["reference_temperature_c"], file["use"][:4]) == (20.0, "Part")
-    row = next(line for line in text.splitlines() if line.startswith("combined standard uncertainty u"))
-    assert row.split()[-1] == f"{file['faces']['5']['position_um']['standard']:.2f}"
+    combined = next(line for line in text.splitlines() if line.startswith("combined standard")).split()[4:]
+    assert combined[-1] == f"{file['faces']['5']['position_um']['standard']:.2f}"
+    html = page.read_text(encoding="utf-8")
+    assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in html
+    assert "<b>A &" not in html
+    row = re.search(r'<th scope="row" class="l">combined standard uncertainty u</th>(.*?)</tr>', html, re.DOTALL)
+    assert row is not None
+    assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
+    assert "-14.0 ppm" in html
+    assert "not a certificate: nothing is stated of" in html
+    circle = next(iter(faces["circles"]))
+    assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
+    assert re.search(r"SHA-256 of the result file</th><td[^>]*>[0-9a-f]{64}<", html)
+    assert not re.search(r'(?:src|href)="(?!data:|#)', html)
+    assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
 
 
 def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
@@ -423,31 +440,6 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
 def test_lengths_that_are_none(plain, tmp_path, row, words):
     (tmp_path / "lengths.csv").write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
     refuses(words, against_stated, plain, tmp_path / "lengths.csv")
-
-
-def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
-    """Fields are text, not markup; a contribution stands in the page as in the terminal."""
-    monkeypatch.setattr(pdf, "pdf_of", lambda page: b"%PDF-" + page[:15].encode())
-    statement, page = tmp_path / "lab.toml", tmp_path / "budget.html"
-    statement.write_text("[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n")
-    field = "operator=<b>A & B</b>"
-    words = ("--statement", statement, "--field", field, "--lengths", small_run, "--report", page, "--pdf")
-    code, text, _ = stcal_sfm("budget", small_run, *words, "-v")
-    assert code == 0
-    html = page.read_text(encoding="utf-8")
-    assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in html
-    assert "<b>A &" not in html
-    combined = next(line for line in text.splitlines() if line.startswith("combined standard")).split()[4:]
-    row = re.search(r'<th scope="row" class="l">combined standard uncertainty u</th>(.*?)</tr>', html, re.DOTALL)
-    assert row is not None
-    assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
-    assert "+40.0 ppm" in html
-    assert "not a certificate: nothing is stated of" in html
-    circle = next(iter(json.loads((small_run / "faces.json").read_text())["circles"]))
-    assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
-    assert re.search(r"SHA-256 of the result file</th><td[^>]*>[0-9a-f]{64}<", html)
-    assert not re.search(r'(?:src|href)="(?!data:|#)', html)
-    assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
 
 
 @pytest.mark.parametrize(

@@ -174,9 +174,17 @@ def known(exact) -> KnownRun:
     return known_from(exact)
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """Few candidates, 25° apart."""
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
+
+
 @pytest.fixture(scope="module")
 def advice(known):
-    return advise(known, 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
+        return advise(known, 2)
 
 
 def after(known: KnownRun, views: list[PlannedView], now: Forecast) -> Forecast:
@@ -195,7 +203,7 @@ def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, commo
     positions = PositionsWith.of(known.models, setup, now.derivatives)
     for model, own in offered(known):
         assert own, model.group
-        for view in own[::3]:
+        for view in own[::9]:
             assert positions(view.model) == pytest.approx(after(known, [view], now).position_sigma_mm(), rel=1e-6)
 
 
@@ -227,18 +235,12 @@ def offered(known):
 
 
 @pytest.mark.slow
-def test_an_advised_view_beats_a_random_one(known, advice):
+def test_an_advised_view_beats_a_random_one(known, advice, coarse):
     views = [view for _, own in offered(known) for view in own]
-    picked = np.random.default_rng(5).choice(len(views), 20, replace=False)
-    random = [after(known, [views[i]], advice.now).worst()[1] for i in picked]
+    random = [after(known, [view], advice.now).worst()[1] for view in views[::2]]
     now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
-    assert best <= min(random)
+    assert best <= min(random) * (1 + 1e-6)
     assert (now - best) > 1.5 * (now - np.mean(random)) > 0
-
-
-@pytest.fixture
-def coarse(monkeypatch):
-    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 50.0)
 
 
 @pytest.mark.slow
@@ -265,9 +267,8 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     assert group.sigma_mm == pytest.approx(forecast(known.models, known.setup).worst()[1], rel=0.15)
 
 
-def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch):
+def test_a_candidate_shows_nothing_that_is_hidden(known, coarse):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
     for model, own in offered(known):
         assert len(own) > 4
         for view in own:
@@ -289,7 +290,8 @@ def test_a_plan_takes_a_camera_as_its_file():
     camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
     target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
     for given in (camera, model_of(camera)):
-        assert session._beside_board(PlanOptions(images=2, camera=given), target, board, None)[0].camera.same_as(camera)
+        options = PlanOptions(images=2, camera=given, groups=(("1", "2"),))
+        assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
         assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
 
@@ -422,7 +424,7 @@ def test_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
     """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
     board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
     board = replace(board, corner_radius_mm=None)
-    options, target = PlanOptions(images=2), reference_target()
+    options, target = PlanOptions(images=2, groups=(("1", "2"), ("1", "4"))), reference_target()
     found = []
     for most in (session.MOST_DOTS, 1000):
         monkeypatch.setattr(session, "MOST_DOTS", most)
