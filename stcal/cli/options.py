@@ -87,7 +87,7 @@ CameraName = Annotated[str, "Take this camera, by name or number, of a --camera 
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
 BoardFile = Annotated[Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference."]
 PlateMargin = Annotated[
-    float, "Assume that plates without outline_mm end this far beyond circles.", Opt("--margin-mm", min=0, max=1e4)
+    float, "Assume that plates without outline_mm end this far beyond circles.", Opt(min=0, max=1e4)
 ]
 Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
 """Distance of the camera in `design`, `plan` and `simulate`: photographs that are forecast can be simulated."""

@@ -69,7 +69,7 @@ def simulate(
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", SEED] = 0,
     body_seed: Annotated[int | None, "Draw errors of target, camera and board with this, not --seed.", SEED] = None,
-    margin: shared.PlateMargin = 15.0,
+    margin_mm: shared.PlateMargin = 15.0,
     workers: shared.Workers = None,
 ) -> None:
     """Write a simulated data set with known truth, of the reference design or your own: images, cameras.txt,
@@ -110,7 +110,7 @@ def simulate(
         poses, pairs = nominal_poses(designs[0], None), pairs_of_faces(groups, designs[0]) if groups else None
         if camera is not None and fisheye is not None:
             raise InputError("E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one")
-        shape: dict[str, Any] = {"distance_mm": distance, "spread_deg": spread, "margin_mm": margin, "groups": pairs}
+        shape: dict[str, Any] = {"distance_mm": distance, "spread_deg": spread, "margin_mm": margin_mm, "groups": pairs}
         shape |= {"width": width, "height": round(width * 2 / 3), "fisheye_deg": fisheye, "images_per_group": images}
         options = SceneOptions(seed=seed, one_board=one_board, body_seed=body_seed, **shape)
         scene = make_scene(options, *designs, poses, model)

@@ -41,7 +41,7 @@ def plan(
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     one_board: Annotated[bool, "Use one plate in all groups, not one each.", Opt("--one-board/--own-boards")] = True,
     seed: Annotated[int, "Place board and cameras at random with this seed.", SEED] = 0,
-    margin: shared.PlateMargin = 15.0,
+    margin_mm: shared.PlateMargin = 15.0,
     out: shared.JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, without Monte Carlo, and say what would help most."""
@@ -72,7 +72,7 @@ def plan(
         centre_noise, source = advise.expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
         source = f"{source} (--noise, --run)"
     model, pairs = read_camera(camera) if camera else None, session.pairs_of_faces(groups, design) if groups else None
-    how = centre_noise, one_board, RunOptions(refine_camera=refine_camera), seed, margin
+    how = centre_noise, one_board, RunOptions(refine_camera=refine_camera), seed, margin_mm
     options = session.PlanOptions(images, spread, distance, width or 5184, model, pairs, *how)
     with shared.designs_told(target, board):
         result = session.plan(options, design, board_file.load_dots(board) if board else None, faces)

@@ -1,6 +1,8 @@
 """σ before and without photographs: against simulations, against the run's own adjustment, and against simple laws."""
 
 import json
+import pickle
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -174,16 +176,21 @@ def known(exact) -> KnownRun:
     return known_from(exact)
 
 
+def look_coarsely(patch: pytest.MonkeyPatch) -> None:
+    """Few candidates, 25° apart, compared in this process: others would not know of it."""
+    patch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
+    patch.setattr("stcal.sfm.planning.advise.kept_processes", nullcontext)
+
+
 @pytest.fixture
 def coarse(monkeypatch):
-    """Few candidates, 25° apart."""
-    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
+    look_coarsely(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def advice(known):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
+        look_coarsely(patch)
         return advise(known, 2)
 
 
@@ -200,7 +207,7 @@ def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, commo
     setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
     known = replace(known, setup=setup)
     now = forecast(known.models, setup)
-    positions = PositionsWith.of(known.models, setup, now.derivatives)
+    positions = handed_over(PositionsWith.of(known.models, setup, now.derivatives))
     for model, own in offered(known):
         assert own, model.group
         for view in own[::9]:
@@ -230,8 +237,13 @@ def test_advised_views_do_what_is_said(known, advice):
     assert stated[1] / stated[0] == pytest.approx(forecasts[1] / forecasts[0], rel=0.1)
 
 
+def handed_over(value):
+    """What another process has of it."""
+    return pickle.loads(pickle.dumps(value))
+
+
 def offered(known):
-    return [(model, candidates(known, model)) for model in known.models]
+    return [(model, handed_over(candidates(*handed_over((known, model))))) for model in known.models]
 
 
 @pytest.mark.slow
