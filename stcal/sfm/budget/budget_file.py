@@ -351,14 +351,10 @@ class BudgetFile(ResultFile):
         answer, refused = answer_of(run), is_refused(run)
         rows = [] if refused else [(row.measurand, Uncertainty.of(row)) for row in budget.rows]
         position_um = {measurand.of: own for measurand, own in rows if measurand.kind == "position" and known}
-        enlarged, poses, faces, angles, distances, circles = (
-            1 + conditions.correction,
-            run.faces.poses(),
-            {},
-            [],
-            [],
-            {},
-        )
+        enlarged, poses = 1 + conditions.correction, run.faces.poses()
+        faces: dict[str, FaceUncertainty] = {}
+        circles: dict[str, CircleUncertainty] = {}
+        angles, distances = [], []
         for measurand, own in rows:
             if measurand.kind == "rotation":
                 pose = poses[measurand.name]
