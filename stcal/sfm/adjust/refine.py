@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from stcal.adjust.blocks import Block, Vector
-from stcal.adjust.engine import Adjustment
+from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import (
     POINT_RADIUS_MM,
     BoardDesign,
@@ -23,7 +23,7 @@ from stcal.design import (
 from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera
-from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
+from stcal.geometry.normal_equations import Reduction, free_motions
 from stcal.geometry.plane import circle_image_offset, fit_plane
 from stcal.geometry.rigid import Poses, Rigid, Similarity, align_rigid, align_similarity, by_pose
 from stcal.geometry.robust import robust_sigma
@@ -349,10 +349,8 @@ class Network:
     residual: np.ndarray  # (n, 2) over σ
     by_pose: np.ndarray  # (n, 2, 6) derivatives of the projections over σ
     by_point: np.ndarray  # (n, 2, 3)
-    inverse: np.ndarray  # (m, 6, 6) of the poses' normal blocks
-    coupling: np.ndarray  # (m, 6, 3p) between poses and points
-    pose_right: np.ndarray  # (m, 6) right-hand sides after the adjustment, almost zero
-    point_right: np.ndarray  # (3p,)
+    poses: Reduction  # elimination of the poses
+    point_right: np.ndarray  # (3p,) right-hand side without the poses, after the adjustment almost zero
     covariance_mm2: np.ndarray  # (3p, 3p) of the points, in the datum of smallest trace
     residual_cofactor: np.ndarray  # (n, 2, 2) covariance of each residual over σ²
 
@@ -390,8 +388,8 @@ class Network:
 
     def pose_covariance(self) -> np.ndarray:
         """Returns (m, 6, 6) rad and mm, in the datum of the points, rotations perturbed on the left."""
-        to_points = self.inverse @ self.coupling
-        return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
+        to_points = self.poses.from_kept
+        return self.poses.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
 
     def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Equations (q, q), (q,) of parameters of the group by the derivatives ``columns`` (n, 2, q) over σ."""
@@ -415,11 +413,11 @@ class Network:
         to_points = np.zeros((2 * k, p, 3))
         for axis in range(2):
             to_points[axis * k + np.arange(k), self.model.point_index[rows]] = self.by_point[rows, axis]
-        eliminated = by_pose @ self.inverse[image]
-        coupled = to_points.reshape(2 * k, 3 * p) - eliminated @ self.coupling[image]
+        coupled = to_points.reshape(2 * k, 3 * p) - by_pose @ self.poses.from_kept[image]
         weighted = coupled @ self.covariance_mm2
-        right = self.residual[rows].T.ravel() - eliminated @ self.pose_right[image]
-        return np.eye(2 * k) - eliminated @ by_pose.T - weighted @ coupled.T, right - weighted @ self.point_right
+        right = self.residual[rows].T.ravel() - by_pose @ self.poses.step[image]
+        normal = np.eye(2 * k) - by_pose @ np.linalg.solve(self.poses.block[image], by_pose.T)
+        return normal - weighted @ coupled.T, right - weighted @ self.point_right
 
     def _by_image(self, e: np.ndarray):
         """Returns by image, without its pose: normal (m, q, q), right side (m, q), coupling to points (m, q, 3p)."""
@@ -432,40 +430,30 @@ class Network:
             right[i] = own @ self.residual[rows].ravel()
         to_points = np.zeros((m, q, p, 3))
         to_points[model.image_index, :, model.point_index] = np.swapaxes(e, 1, 2) @ self.by_point
-        eliminated = by_pose @ self.inverse
         return (
-            normal - eliminated @ np.swapaxes(by_pose, 1, 2),
-            right - np.einsum("mqi,mi->mq", eliminated, self.pose_right),
-            to_points.reshape(m, q, 3 * p) - eliminated @ self.coupling,
+            normal - by_pose @ self.poses.inverse @ np.swapaxes(by_pose, 1, 2),
+            right - np.einsum("mqi,mi->mq", by_pose, self.poses.step),
+            to_points.reshape(m, q, 3 * p) - by_pose @ self.poses.from_kept,
         )
 
 
 def free_network(model: GroupModel, camera: Camera) -> Network:
-    by_pose, by_point = projection_jacobians(model, camera)
-    a, b = model.whiten(by_pose), model.whiten(by_point)
-    m, p = len(model.images), len(model.labels)
-    residual = model.whiten(model.residuals_px(camera))
-    coupling = np.zeros((m, p, 6, 3))
-    coupling[model.image_index, model.point_index] = np.swapaxes(a, 1, 2) @ b
-    coupling = coupling.transpose(0, 2, 1, 3).reshape(m, 6, 3 * p)
-    poses, pose_right = blocks_of(a, residual, model.image_index, m)
-    points, point_right = blocks_of(b, residual, model.point_index, p)
-    reduction = reduce(poses, pose_right, coupling)
-    normal = -reduction.normal
-    place = 3 * np.arange(p)[:, None] + np.arange(3)
-    normal[place[:, :, None], place[:, None]] += points
-    covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
+    a = Adjustment()
+    points = a.block("points", Vector(model.xyz_model))
+    poses = a.block("poses", Poses.of(model.camera_from_model), eliminate=True)
+    reproject(a, model, (points, poses), lambda *_: camera)
+    joined = Joined([a], ("points",), lambda values: free_motions(values["points"].array, scale=True))
+    (solution,) = joined.at({block.name: block.start for block in a.blocks}).whole
+    (rows,), covariance, p = solution.rows, solution.inverse, len(model.labels)
+    by_point, by_pose = rows.slopes
     # cofactors of each adjusted observation, (n, 2, 2)
-    inverse, weighted = reduction.inverse, reduction.from_kept @ covariance
-    pose = inverse + weighted @ np.swapaxes(reduction.from_kept, 1, 2)
-    mixed = weighted.reshape(m, 6, p, 3)[model.image_index, :, model.point_index]
+    mixed = (solution.reduction.from_kept @ covariance).reshape(-1, 6, p, 3)[model.image_index, :, model.point_index]
     blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
-    cross = a @ mixed @ np.swapaxes(b, 1, 2)
-    of_poses = a @ pose[model.image_index] @ np.swapaxes(a, 1, 2)
-    of_points = b @ blocks[model.point_index] @ np.swapaxes(b, 1, 2)
+    cross = by_pose @ mixed @ np.swapaxes(by_point, 1, 2)
+    of_poses = by_pose @ solution.covariance(poses)[model.image_index] @ np.swapaxes(by_pose, 1, 2)
+    of_points = by_point @ blocks[model.point_index] @ np.swapaxes(by_point, 1, 2)
     cofactor = np.eye(2) - (of_poses - cross - np.swapaxes(cross, 1, 2) + of_points)
-    right = point_right.ravel() - reduction.right
-    return Network(model, residual, a, b, inverse, coupling, pose_right, right, covariance, cofactor)
+    return Network(model, -rows.residual, by_pose, by_point, solution.reduction, solution.right, covariance, cofactor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

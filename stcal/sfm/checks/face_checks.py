@@ -1,20 +1,20 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, reduce
 from itertools import combinations
+from operator import matmul
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from stcal.design import faces_of_known_shape
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid, UncertainRigid
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.refine import Network
@@ -179,34 +179,26 @@ def loops_check(evidence: Evidence, joint: JointResult) -> Check:
     single = {group: _adjusted(evidence, joint, (m for m in models if m.group == group)) for group in groups}
 
     @cache  # several ways share a step
-    def step_of(group: str, a: str, b: str) -> tuple[Rigid, np.ndarray]:
+    def step_of(group: str, a: str, b: str) -> UncertainRigid:
         target = _posed(evidence, single[group], (a, b))
-        return target.target_from_face[b], target.face_covariance[b]
+        return UncertainRigid(target.target_from_face[b], target.face_covariance[b])
+
+    def along(way: FaceChain) -> UncertainRigid:
+        """Returns reference_from_face along a way, with each group adjusted alone."""
+        steps = zip(way.groups, way.faces[:-1], way.faces[1:], strict=True)
+        return reduce(matmul, (step_of(*step) for step in steps))
 
     trials = []
     redundancy = sum(2 * len(m.image_index) for m in models)
     for face, first, second in pairs:
         with suppress(StcalError):
-            (one, of_one), (other, of_other) = (_along(step_of, way) for way in (first, second))
+            one, other = along(first), along(second)
             name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
-            trials.append(_face_trial(name, one, other, of_one + of_other, redundancy))
+            trials.append(_face_trial(name, one.rigid, other.rigid, one.covariance + other.covariance, redundancy))
     if not trials:
         return impossible("loops", "no face is reached in two ways that share no group", _loop_remedy(evidence))
     remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
     return assess("loops", trials, "loops", remedy, covered=True)
-
-
-def _along(step_of: Callable[[str, str, str], tuple[Rigid, np.ndarray]], way: FaceChain) -> tuple[Rigid, np.ndarray]:
-    """Returns reference_from_face along a way, with each group adjusted alone, and its covariance (6, 6)."""
-    pose, covariance = Rigid(), np.zeros((6, 6))
-    for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
-        step, step_covariance = step_of(group, a, b)
-        # The pose of face a turns the step to face b; an error of its rotation moves b by the lever arm from a to b.
-        arm = np.block([[np.eye(3), np.zeros((3, 3))], [-skew(pose.rotation @ step.translation), np.eye(3)]])
-        turn = block_diag(pose.rotation, pose.rotation)
-        covariance = arm @ covariance @ arm.T + turn @ step_covariance @ turn.T
-        pose = pose @ step
-    return pose, covariance
 
 
 def agreement_check(evidence: Evidence, joint: JointResult) -> Check:
