@@ -41,8 +41,6 @@ from stcal.geometry.normal_equations import (
 
 HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
-LEFT = 1e-9
-"""Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 LOOSE = 1e-10
 """Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
 AT_ONCE = 10_000  # number of rows whose derivatives are multiplied at once; it bounds the memory
@@ -350,27 +348,16 @@ class Solution:
 
     def without(self, cluster: int) -> dict[str, Any]:
         """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
-        dropped = self.reduction.step.shape
-        totals, slopes, residuals = [], [], []
+        rest, others = self.problem.at(self.values), []
         for rows in self.rows:
-            if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
-                continue
-            totals.append(rows.total(self._each)[own].reshape(-1, self.kept))
-            residuals.append(rows.residual[own].ravel())
-            by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
-            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
-                if block.eliminate:
-                    by_dropped[np.arange(own.sum()), :, numbers(index, slope)[own]] = slope[own]
-            slopes.append(by_dropped.reshape(residuals[-1].size, *dropped))
-        if not totals:
+            factor = rows.factor
+            keep = np.ones(len(rows.residual), bool) if factor.cluster is None else factor.cluster != cluster
+            slopes = [slope * keep[:, None, None] for slope in rows.slopes]
+            others.append((keep, replace(rows, residual=rows.residual * keep[:, None], slopes=slopes)))
+        if all(keep.all() for keep, _ in others):
             raise InputError("E-OPTION-NEEDS", f"adjustment: no row of cluster {cluster}; give one that factors have")
-        total, slope, residual = (np.concatenate(each) for each in (totals, slopes, residuals))
-        solved = np.einsum("mab,rmb->rma", self.reduction.inverse, slope)
-        taken = total @ self.inverse @ total.T + np.einsum("rma,sma->rs", slope, solved)
-        pull = np.linalg.lstsq(np.eye(len(residual)) - taken, residual, rcond=LEFT)[0]
-        kept = self.inverse @ (total.T @ pull)
-        away = np.einsum("rma,r->ma", solved, pull) - self.reduction.from_kept @ kept
-        return self.problem.moved(self.values, np.concatenate([kept, away.ravel()]))
+        vars(rest)["rows"] = [rows for _, rows in others]  # in place of what its cached property would compute
+        return self.problem.moved(self.values, rest.step(0.0)[0])
 
     def redundancy(self, kind: str | None = None) -> float:
         """Return the redundancy of the rows of one kind, or of all."""

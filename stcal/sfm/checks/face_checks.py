@@ -33,23 +33,19 @@ def _loop_remedy(evidence: Evidence) -> str:
     return "add a group that closes a loop of faces" if evidence.board.rows or len(evidence.linked) > 1 else ""
 
 
-def _adjusted(evidence: Evidence, whole: JointResult, models: Iterable[MetricModel]) -> JointResult | StcalError:
-    """Adjusts a part of the models as the run did, from its result and with its intrinsics; returns the error if there
-    is no result."""
+def _adjusted(evidence: Evidence, whole: JointResult, models: Iterable[MetricModel]) -> JointResult:
+    """Adjusts a part of the models as the run did, from its result and with its intrinsics."""
     models = [model for model in models if model.images]  # a part of a group may hold no two images of a point
+    if not models:
+        raise _unfixed(models)
     try:
-        part = adjust_part(models, evidence.board, evidence.options.flatness_mm, whole) if models else None
-        return widened_result(part) if part else _unfixed(models)
-    except StcalError as error:
-        return error
-    except np.linalg.LinAlgError:
-        return _unfixed(models)
+        return widened_result(adjust_part(models, evidence.board, evidence.options.flatness_mm, whole))
+    except np.linalg.LinAlgError as error:
+        raise _unfixed(models) from error
 
 
-def _posed(evidence: Evidence, joint: JointResult | StcalError, faces: Sequence[str]) -> CalibratedTarget:
+def _posed(evidence: Evidence, joint: JointResult, faces: Sequence[str]) -> CalibratedTarget:
     """Returns the poses of ``faces``, in the frame of the first one, by the adjustment of a part of the models."""
-    if isinstance(joint, StcalError):
-        raise joint
     whole = evidence.calibration.target
     start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
     try:
@@ -79,13 +75,12 @@ def halves_check(evidence: Evidence, joint: JointResult) -> Check:
     if len(fewest.images) < 2 * MIN_HALF:
         reason = f"group {fewest.group} has {len(fewest.images)} images, {2 * MIN_HALF} needed"
         return impossible("halves", reason, "add images")
-    halves = [_adjusted(evidence, joint, (m.without(m.image_index % 2 != k) for m in models)) for k in (0, 1)]
     try:
+        halves = [_adjusted(evidence, joint, (m.without(m.image_index % 2 != k) for m in models)) for k in (0, 1)]
         first, second = (_posed(evidence, half, faces) for half in halves)
     except StcalError as error:
         return impossible("halves", f"half of the images do not determine the result ({error})", "add images")
-    redundancy = sum(half.redundancy for half in halves if isinstance(half, JointResult))
-    trials = []
+    redundancy, trials = sum(half.redundancy for half in halves), []
     for face in faces[1:]:
         covariance = first.face_covariance[face] + second.face_covariance[face]
         poses = first.target_from_face[face], second.target_from_face[face]
@@ -111,8 +106,9 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
         others = [shown for other, shown in members.items() if other != group]
         if not others or set(faces) - _linked(others, faces[0]):
             continue
-        part = _adjusted(evidence, joint, (m for m in joint.models if m.group != group))
-        if isinstance(part, StcalError):
+        try:
+            part = _adjusted(evidence, joint, (m for m in joint.models if m.group != group))
+        except StcalError:
             continue
         extra, freedom, free = _added(part, [n for n in evidence.linked if n.model.group != group])
         if freedom < 1 or float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS:  # the others agree
@@ -175,12 +171,14 @@ def loops_check(evidence: Evidence, joint: JointResult) -> Check:
         for first, second in combinations(chains, 2)
         if not set(first.groups) & set(second.groups)
     ]
-    groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
-    single = {group: _adjusted(evidence, joint, (m for m in models if m.group == group)) for group in groups}
 
-    @cache  # several ways share a step
+    @cache  # several ways share a group, and a step
+    def alone(group: str) -> JointResult:
+        return _adjusted(evidence, joint, (model for model in models if model.group == group))
+
+    @cache
     def step_of(group: str, a: str, b: str) -> UncertainRigid:
-        target = _posed(evidence, single[group], (a, b))
+        target = _posed(evidence, alone(group), (a, b))
         return UncertainRigid(target.target_from_face[b], target.face_covariance[b])
 
     def along(way: FaceChain) -> UncertainRigid:
