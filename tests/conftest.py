@@ -159,18 +159,19 @@ class LabelsOnly:
         world_from_target = Similarity(1 / unit_mm, Rigid.exp([0.3, -0.2, 0.5, 40, -30, 900]))
         return [model.in_world(world_from_target) for model in true_models(scene, observations)]
 
+    def adjusted(self, scene: Scene, observations: list[ImageObservations]) -> list[WorldModel]:
+        """Models of the groups, each adjusted by itself with the eccentricity of the true geometry."""
+        radius, camera = scene.target.radius_of() | scene.board.radius_of(), scene.camera
+        shifts = ((m, eccentricity_px(m, camera, radius, 1.0)) for m in self.models(scene, observations))
+        return [adjust(replace(model, shift_px=shift), camera) for model, shift in shifts]
+
     def calibrate(self, scene: Scene, noise_px: float, seed: int, solve: str = "joint"):
         """Chain or joint calibration from labels; returns (CalibratedTarget, JointResult or None)."""
         target, board, camera = scene.target, scene.board, scene.camera
-        radius = target.radius_of() | board.radius_of()
-        observations = self.observations(scene, noise_px, np.random.default_rng(seed))
-        models, faces, scales = [], [], {}
-        for start in self.models(scene, observations):
-            model = replace(start, shift_px=eccentricity_px(start, camera, radius, 1.0))
-            model = adjust(model, camera)
-            scales[model.group] = find_scale(model, board).mm_per_unit
+        models = self.adjusted(scene, self.observations(scene, noise_px, np.random.default_rng(seed)))
+        scales, faces = {m.group: find_scale(m, board).mm_per_unit for m in models}, []
+        for model in models:
             faces += faces_of_group(model.metric(Similarity(scales[model.group], Rigid())), camera, target, "plane")[0]
-            models.append(model)
         chained = chain_faces(faces, target, target.faces[0].id)
         if solve == "chain":
             return chained, None

@@ -1,7 +1,5 @@
 """Face frames, also where no image shows their circles, and their chaining into the target frame."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains
-from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with, refuses
 from tests.support.image_poses import pose_error
@@ -62,26 +59,21 @@ def in_group(group, face_id, error=None, weight=1.0):
     return FaceInGroup(group, face_id, pose, tuple(face.labels()), xyz, information, 4)
 
 
-def test_exact_groups_chain_exactly():
-    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
-    target = chain_faces(faces, TARGET, "1")
+FACES = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
+ERROR = [0, 0, 0, 0.0, 0.03, 0.0]
+
+
+def test_exact_groups_chain_exactly_and_another_reference_face_moves_the_frame_alone():
+    one, two = chain_faces(FACES, TARGET, "1"), chain_faces(FACES, TARGET, "2")
     for face_id, pose in TRUE.items():
-        np.testing.assert_allclose(target.target_from_face[face_id].matrix(), pose.matrix(), atol=1e-9)
-    np.testing.assert_allclose(target.circles["3:2"], TRUE["3"] @ [40.0, 0, 0], atol=1e-9)
-
-
-def test_another_reference_face_moves_the_frame_and_nothing_else():
-    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
-    one, two = chain_faces(faces, TARGET, "1"), chain_faces(faces, TARGET, "2")
-    two_from_one = two.target_from_face["1"]
-    for face_id, pose in one.target_from_face.items():
-        np.testing.assert_allclose((two_from_one @ pose).matrix(), two.target_from_face[face_id].matrix(), atol=1e-9)
+        np.testing.assert_allclose(one.target_from_face[face_id].matrix(), pose.matrix(), atol=1e-9)
+        moved = two.target_from_face["1"] @ one.target_from_face[face_id]
+        np.testing.assert_allclose(moved.matrix(), two.target_from_face[face_id].matrix(), atol=1e-9)
+    np.testing.assert_allclose(one.circles["3:2"], TRUE["3"] @ [40.0, 0, 0], atol=1e-9)
 
 
 def test_two_ways_to_a_face_are_combined_and_their_disagreement_is_told():
-    error = [0, 0, 0, 0.0, 0.03, 0.0]
-    faces = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) for f in pair]
-    faces += [in_group("d", "3", error), in_group("d", "4")]
+    faces = [*FACES, in_group("d", "3", ERROR), in_group("d", "4")]
     target = chain_faces(faces, TARGET, "1")
     shift = target.target_from_face["3"].translation - TRUE["3"].translation
     assert 0.005 < np.linalg.norm(shift) < 0.025  # between the two ways, 30 µm apart
@@ -107,9 +99,7 @@ def test_ways_have_at_most_one_face_more_than_the_shortest():
 
 
 def test_a_better_fixed_face_weighs_more():
-    error = [0, 0, 0, 0.0, 0.03, 0.0]
-    faces = [in_group("a", "1", weight=100), in_group("a", "2", weight=100), in_group("b", "1", weight=100)]
-    faces += [in_group("b", "2", error, weight=1)]
+    faces = [in_group(*own, weight=100) for own in ("a1", "a2", "b1")] + [in_group("b", "2", ERROR, weight=1)]
     shift = chain_faces(faces, TARGET, "1").target_from_face["2"].translation - TRUE["2"].translation
     assert np.linalg.norm(shift) < 0.003
 
@@ -117,19 +107,15 @@ def test_a_better_fixed_face_weighs_more():
 def test_faces_that_no_group_links_are_left_out_with_the_remedy(labels_only):
     pairs = (("1", "2"), ("3", "4"))
     scene = make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=2, groups=pairs))
-    observations = labels_only.observations(scene, 0.005, np.random.default_rng(0))
-    models = [adjust(model, scene.camera) for model in labels_only.models(scene, observations)]
-    found = calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions("1", solve="chain"))
-    left_out = {"3", "4"}
-    assert {"1", "2"} <= found.target.target_from_face.keys()
-    assert not left_out & found.target.target_from_face.keys()
-    for face_id in left_out:
+    found = calibrated(scene, labels_only, (), solve="chain")
+    assert found.target.target_from_face.keys() == {"1", "2"}
+    for face_id in "34":
         start = f"face {face_id}: left out, never linked to reference face 1; add a group that shows"
         assert sum(note.startswith(start) for note in found.notes) == 1
 
 
 def test_the_reference_face_must_be_there_and_linked_to_all():
-    faces = [in_group("a", "1"), in_group("a", "2"), in_group("b", "3"), in_group("b", "4")]
+    faces = [in_group(*own) for own in ("a1", "a2", "b3", "b4")]
     refuses("E-FACE-UNLINKED … 3, 4 … 1", chain_faces, faces, TARGET, "1")
     refuses("E-FACE-REFERENCE … 5", chain_faces, faces[:2], TARGET, "5")
     refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", chain_faces, [in_group("a", "1")], TARGET, "9")
@@ -141,20 +127,15 @@ def calibrated(scene, labels_only, hidden, seed=0, groups=("12", "14"), solve="j
         image.select([i for i, label in enumerate(image.labels) if not (label in hidden and image.group in groups)])
         for image in labels_only.observations(scene, 0.02, np.random.default_rng(seed))
     ]
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    models = []
-    for start in labels_only.models(scene, observations):
-        model = replace(start, shift_px=eccentricity_px(start, scene.camera, radius, 1.0))
-        models.append(adjust(model, scene.camera))
+    models = labels_only.adjusted(scene, observations)
     return calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions(reference_face="1", solve=solve))
 
 
 @pytest.fixture(scope="module")
 def scene():
     """Two groups of five views, half-size camera."""
-    return make_scene(
-        SceneOptions(seed=3, width=2592, height=1728, images_per_group=5, groups=(("1", "2"), ("1", "4")))
-    )
+    pairs = (("1", "2"), ("1", "4"))
+    return make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=5, groups=pairs))
 
 
 @pytest.mark.slow

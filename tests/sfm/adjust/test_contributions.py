@@ -20,7 +20,6 @@ from stcal.sfm.adjust.uncertainty import (
     contributions_of,
     derivatives,
 )
-from stcal.synthetic.scene import SceneOptions, make_scene
 
 FLATNESS_MM = 0.02
 SIGMAS = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
@@ -28,12 +27,9 @@ SIGMAS = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
 
 
 @pytest.fixture(scope="module")
-def case(labels_only):
-    scene = make_scene(
-        SceneOptions(seed=9, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
-    )
-    models = labels_only.models(scene, labels_only.observations(scene, 0.01, np.random.default_rng(2)))
-    return models, scene
+def case(labels_only, small_scene):
+    observed = labels_only.observations(small_scene, 0.01, np.random.default_rng(2))
+    return labels_only.models(small_scene, observed), small_scene
 
 
 def state_of(case, refined=False, common=None, board=None, camera=None):

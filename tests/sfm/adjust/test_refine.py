@@ -1,4 +1,4 @@
-"""One group: its free network against the same equations in full, score tests, and λ from the board."""
+"""One group: its free network against the same equations in full, score tests, weights, and λ from the board."""
 
 from dataclasses import replace
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc
 
-from stcal.design import reference_board
+from stcal.design import BoardDesign, reference_board
 from stcal.geometry.rigid import Rigid, skew
-from stcal.sfm.adjust.refine import adjust, eccentricity_px, find_scale, free_network, solve_score
+from stcal.labels import CircleLabel, DotLabel
+from stcal.sfm.adjust import equations
+from stcal.sfm.adjust.equations import GroupPart, Setting
+from stcal.sfm.adjust.refine import adjust, find_scale, free_network, solve_score
 from stcal.sfm.data.group_model import WorldModel
-from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 
 NOISE_PX, FACTOR = 0.01, 1.3
@@ -34,16 +36,10 @@ def jacobian_of(model, camera) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def group(labels_only):
+def group(labels_only, small_scene):
     """An adjusted group of four images, mm, and its camera."""
-    scene = make_scene(
-        SceneOptions(seed=8, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
-    )
-    observed = labels_only.observations(scene, NOISE_PX, np.random.default_rng(2))
-    start = labels_only.models(scene, observed)[0]
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    start = replace(start, shift_px=eccentricity_px(start, scene.camera, radius, 1.0))
-    return adjust(start, scene.camera), scene.camera
+    observed = labels_only.observations(small_scene, NOISE_PX, np.random.default_rng(2))
+    return labels_only.adjusted(small_scene, observed)[0], small_scene.camera
 
 
 @pytest.fixture(scope="module")
@@ -68,17 +64,14 @@ def full(group):
     return jacobian, np.linalg.inv(bordered)[:size, :size]
 
 
-def test_covariance_of_the_points_is_that_of_the_full_equations(network, full, group):
+def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations(network, full, group):
+    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown."""
     p = 3 * len(group[0].labels)
     scale = np.sqrt(np.diag(network.covariance_mm2))
     np.testing.assert_allclose(
         network.covariance_mm2 / np.outer(scale, scale), full[1][-p:, -p:] / np.outer(scale, scale), atol=1e-5
     )
     np.testing.assert_array_equal(network.covariance_of([3, 1])[3:, :3], network.covariance_mm2[3:6, 9:12])
-
-
-def test_redundancy_is_that_of_the_full_equations(network, full, group):
-    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown."""
     jacobian, cofactors = full
     own = 1 - np.einsum("ij,jk,ik->i", jacobian, cofactors, jacobian)
     np.testing.assert_allclose(network.redundancy, own.reshape(-1, 2).sum(1), atol=1e-6)
@@ -87,6 +80,8 @@ def test_redundancy_is_that_of_the_full_equations(network, full, group):
     assert square.sum() == pytest.approx((network.residual**2).sum())
     assert redundancy.sum() == pytest.approx(network.redundancy.sum())
     assert len(square) == len(group[0].images)
+    assert network.noise() == 1.0  # σ that are as stated are never made smaller
+    assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0
 
 
 def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, group):
@@ -117,9 +112,9 @@ def test_what_an_image_explains_is_what_leaving_it_out_changes(network):
 
 
 def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
-    """One image's focal length 1e-4 longer: 100 times its σ there."""
+    """One image's focal length 1e-3 longer: eleven times its σ there."""
     model, camera = group
-    image = 2
+    image = 1
     own = model.image_index == image
     stretched = model.measured_px.copy()
     stretched[own] += 1e-3 * (stretched[own] - camera.centre)
@@ -154,10 +149,52 @@ def test_squares_of_observations_are_chi_square(network, full):
     assert 0.8 < beyond / (1e-3 * count) < 1.25
 
 
-def test_the_noise_of_a_group_is_that_of_its_residuals(network):
-    """σ that are as stated are never made smaller."""
-    assert network.noise() == 1.0
-    assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0
+def test_weights_are_hubers_and_the_cost_is_theirs(group):
+    """Weight 1 within the limit and limit/length beyond; the cost's derivative by a residual is 2 w r."""
+    model, camera = group
+    far = model.measured_px.copy()
+    far[5] += [1.0, 0.0]
+    model = replace(model, measured_px=far)
+    length = np.linalg.norm(equations.normalised(model, camera), axis=1)
+    weights = equations.robust_weights(model, camera, 4.0)
+    assert weights[5] == pytest.approx(4 / length[5])
+    assert (weights[length < 4] == 1).all()
+
+    def cost(shift: float) -> float:
+        changed = far.copy()
+        changed[5, 0] += shift
+        return equations.image_cost(replace(model, measured_px=changed), camera, 4.0)
+
+    gradient = (cost(1e-4) - cost(-1e-4)) / 2e-4
+    by_x = model.whiten(np.tile([1.0, 0.0], (len(far), 1)))[5]
+    turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
+    assert equations.image_cost(replace(model, camera_from_model=turned), camera, 4.0) == np.inf  # behind them
+    assert gradient == pytest.approx(2 * weights[5] * by_x @ equations.normalised(model, camera)[5], rel=1e-5)
+
+
+def test_dots_off_their_design_cost_their_squares_over_sigma(group):
+    model, camera = group
+    (dot_rows,) = np.nonzero([isinstance(label, DotLabel) for label in model.labels])
+    (circle_rows,) = np.nonzero([isinstance(label, CircleLabel) for label in model.labels])
+    labels = tuple(model.labels[i] for i in circle_rows)
+
+    def cost(off_mm: np.ndarray) -> float:
+        own = GroupPart(
+            model=model,
+            model_from_board=Rigid(),
+            design=model.xyz_model[dot_rows] + off_mm,
+            dots=dot_rows,
+            circles=circle_rows,
+            cells=np.arange(len(dot_rows)),
+            circle_place=np.arange(len(circle_rows)),
+        )
+        board = BoardDesign(10, 10, 20.0, 5.0, "bright", sigma_mm=0.02)
+        setting = Setting((own,), labels, board, 0.0, np.inf, camera, np.zeros((16, 0)), np.zeros((0, 0)), np.inf)
+        values = setting.values(model.xyz_model[circle_rows], camera)
+        return setting.joined(values).cost(values)
+
+    off = np.random.default_rng(0).normal(0, 0.05, (len(dot_rows), 3))
+    assert cost(off) - cost(0 * off) == pytest.approx((off**2).sum() / 0.02**2, rel=1e-6)
 
 
 BOARD = reference_board()
@@ -166,10 +203,8 @@ WORLD_FROM_BOARD = Rigid.exp([0.4, -0.2, 0.9, 3.0, 1.0, 20.0])
 
 def model_of(xyz_board, labels, mm_per_unit=25.0):
     xyz = (WORLD_FROM_BOARD @ xyz_board) / mm_per_unit
-    none = np.zeros(0)
-    return WorldModel(
-        "g", (), (), tuple(labels), xyz, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2))
-    )
+    none, pairs = np.zeros(0), np.zeros((0, 2))
+    return WorldModel("g", (), (), tuple(labels), xyz, none, none, none, pairs, pairs, np.zeros((0, 2, 2)))
 
 
 def board_xyz():

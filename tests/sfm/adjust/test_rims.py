@@ -7,7 +7,6 @@ import pytest
 
 from stcal.boards.board_file import board_toml, load_board
 from stcal.boards.target_file import load_target, target_toml
-from stcal.errors import InputError
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.rims import RadiusViews, Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board_checks import rim_check
@@ -17,13 +16,13 @@ from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import sampled
+from tests.outcome import fails_with
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return make_scene(SceneOptions(seed=6, width=1296, height=864, images_per_group=4, groups=(("1", "2"),)))
+def scene(small_scene):
+    return small_scene
 
 
 def rim_of(short, tangent, radius, blur, image) -> Rim:
@@ -69,15 +68,21 @@ def test_rims_that_are_not_seen_or_harm_nothing_are_no_fault():
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002, {}).verdict == "suspicious"
 
 
-@pytest.mark.parametrize("solve", ["chain", "paper"])
-def test_rims_need_the_joint_adjustment(scene, solve):
-    with pytest.raises(InputError, match="--solve joint") as error:
-        RunOptions(solve=solve, rim=True).settled(scene.target)
-    assert error.value.code == "E-RIM-SOLVE"
+@pytest.mark.parametrize(
+    ("options", "refusal"),
+    [
+        ({"solve": "chain", "rim": True}, "E-RIM-SOLVE … --solve joint"),
+        ({"solve": "paper", "rim": True}, "E-RIM-SOLVE … --solve joint"),
+        ({"solve": "chain", "refine_camera": True}, "E-OPTION-NEEDS … --solve"),
+    ],
+)
+def test_rims_and_refined_intrinsics_need_the_joint_adjustment(scene, options, refusal):
+    with fails_with(refusal):
+        RunOptions(**options).settled(scene.target)
     assert RunOptions(rim=True).settled(scene.target).rim
 
 
-def test_a_design_states_its_rims(scene, tmp_path):
+def test_designs_of_target_and_board_state_rims(scene, tmp_path):
     face = scene.target.faces[0]
     heights = np.where(np.arange(len(face.ids)) == 2, -0.1, 0.25)
     target = replace(scene.target, faces=(replace(face, rim_mm=heights), *scene.target.faces[1:]))
@@ -86,16 +91,6 @@ def test_a_design_states_its_rims(scene, tmp_path):
     np.testing.assert_array_equal(read.faces[0].rim_mm, heights)
     assert read.faces[1].rim_mm is None
     assert read.rim_of() == dict(zip(face.labels(), heights.tolist(), strict=True))
-
-
-def test_a_rim_hides_what_is_not_in_common_of_two_discs():
-    """Of the radius by area. That of the fit, which follows the rim, is less by up to 2 %."""
-    apart = np.array([0.05, 0.1, 0.15])
-    area = 2 * np.arccos(apart / 2) - apart / 2 * np.sqrt(4 - apart**2)
-    np.testing.assert_allclose(lost_radius_mm(0.1, 10 * 5.0 * apart, 5.0) / 5.0, 1 - np.sqrt(area / np.pi), rtol=0.02)
-
-
-def test_a_board_states_the_rims_of_its_dots(scene, tmp_path):
     board = replace(scene.board, rim_mm=0.3)
     (tmp_path / "board.toml").write_text(board_toml(board), encoding="utf-8")
     assert load_board(tmp_path / "board.toml").rim_mm == 0.3
@@ -104,6 +99,13 @@ def test_a_board_states_the_rims_of_its_dots(scene, tmp_path):
     passed = rim_check(rims, 0.002, {"dots": board.rim_mm})
     assert passed.verdict == "passed"
     assert "0.3 mm stated" in passed.reason
+
+
+def test_a_rim_hides_what_is_not_in_common_of_two_discs():
+    """Of the radius by area. That of the fit, which follows the rim, is less by up to 2 %."""
+    apart = np.array([0.05, 0.1, 0.15])
+    area = 2 * np.arccos(apart / 2) - apart / 2 * np.sqrt(4 - apart**2)
+    np.testing.assert_allclose(lost_radius_mm(0.1, 10 * 5.0 * apart, 5.0) / 5.0, 1 - np.sqrt(area / np.pi), rtol=0.02)
 
 
 def test_rims_of_dots_move_the_board_and_no_face(scene):

@@ -63,7 +63,7 @@ def views_of(
 
 
 def calibrated(views, model="OPENCV", board=BOARD):
-    start = closed_form(views, board, intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV"))
+    start = closed_form(views, board, intrinsics.start_camera(TRUE.width, TRUE.height, model))
     return adjust_intrinsics(views, board, start, model)
 
 
@@ -142,7 +142,7 @@ def test_intrinsics_that_are_held_stay_and_the_poses_follow():
     assert np.sqrt((held.residuals_px() ** 2).mean()) > 2 * np.sqrt((free.residuals_px() ** 2).mean())
 
 
-def test_closed_form_finds_the_focal_length():
+def test_closed_form_finds_the_focal_length_and_where_it_gives_none_several_are_tried(monkeypatch):
     # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
     pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
     start = intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")
@@ -150,6 +150,9 @@ def test_closed_form_finds_the_focal_length():
         found = closed_form(views_of(np.random.default_rng(9), noise_px=1e-3, camera=camera), BOARD, start).focal
         assert found == pytest.approx([2790, 2790], rel=tolerance)
         assert (found != start.focal).all()
+    monkeypatch.setattr(intrinsics, "FOCAL_LIMITS", (60.0, 60.0))
+    found = closed_form(views_of(np.random.default_rng(1), count=6), BOARD, start).focal
+    assert 2**-0.3 < found[0] / TRUE.focal[0] < 2**0.3  # the nearest of a row with steps of √2 is within 2^¼
 
 
 BENT = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
@@ -290,7 +293,10 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     assert any("no dots near the corner" in warning for warning in summary["warnings"])
 
 
-def test_images_without_a_board_are_refused(stcal_sfm, tmp_path):
+def test_an_unknown_model_and_images_without_a_board_are_refused(stcal_sfm, small_dataset, tmp_path):
+    words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
+    ended = stcal_sfm(*words)
+    assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
     (tmp_path / "images").mkdir()
     for i in range(3):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((300, 400), 60 + i, np.uint8))
@@ -312,12 +318,6 @@ def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     assert "12/IMG_1002.jpg: 600×400 px, but the majority of the images says 1296×864 px" in message
 
 
-def test_an_unknown_model_ends_the_command(stcal_sfm, small_dataset, tmp_path):
-    words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
-    ended = stcal_sfm(*words)
-    assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
-
-
 @pytest.mark.parametrize(("bow_mm", "spread", "count", "factor"), [(0.3, 1.0, 12, 1.0), (0.0, 0.4, 20, 0.45)])
 def test_a_bend_of_the_board_is_none_of_its_dots_and_dots_nearer_than_stated_are_told(bow_mm, spread, count, factor):
     """χ² of 8 parameters stays below 26 (p = 0.001); the factor of 3 · 63 dots scatters by 5 %."""
@@ -331,14 +331,6 @@ def test_a_bend_of_the_board_is_none_of_its_dots_and_dots_nearer_than_stated_are
     assert 0.75 * factor < result.factors.dots < 1.25 * factor
     bent = result.models[0].xyz_model[:, 2]
     assert np.ptp(bent) == pytest.approx(bow_mm, abs=0.06)  # six σ of the dots at random, two at each end
-
-
-def test_where_the_closed_form_gives_no_focal_length_several_are_tried(monkeypatch):
-    """The nearest of a row with steps of √2 is within a factor of 2^¼."""
-    monkeypatch.setattr("stcal.sfm.camera.intrinsics.FOCAL_LIMITS", (60.0, 60.0))
-    views = views_of(np.random.default_rng(1), count=6)
-    found = closed_form(views, BOARD, intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")).focal[0]
-    assert 2**-0.3 < found / TRUE.focal[0] < 2**0.3
 
 
 def test_a_descent_that_does_not_end_begins_again_and_says_so(monkeypatch):

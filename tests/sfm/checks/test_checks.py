@@ -1,6 +1,7 @@
 """Planted faults are caught by a check that names them; honest runs pass. Labels only, but for a blurred photograph."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
@@ -18,7 +19,7 @@ from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import face_checks
 from stcal.sfm.checks.board_checks import board_checks, radius_checks
-from stcal.sfm.checks.image_checks import moved_check
+from stcal.sfm.checks.image_checks import UNEVEN_BY_CHANCE, evenness_check, moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.pipeline import run
@@ -136,30 +137,83 @@ def test_the_joint_result_is_checked_by_its_parts(labels_only, lab, monkeypatch)
     assert {checks[key].verdict for key in ("halves", "groups")} == {"not possible"}
 
 
-def test_exchanged_labels_are_named(full_scene, lab):
-    images = lab.observe(full_scene)
-    place = [images[3].labels.index(label) for label in ("1:2", "1:6")]
-    centre = images[3].centre_px.copy()
+def exchanged(scene, lab):
+    images = lab.observe(scene)
+    place, centre = [images[3].labels.index(label) for label in ("1:2", "1:6")], images[3].centre_px.copy()
     centre[place] = centre[place[::-1]]
     images[3] = replace(images[3], centre_px=centre)
-    check = lab.check(full_scene, images)["labels"]
-    assert check.verdict == "failed"
-    assert check.names[0] in ("12/0003: 1:2 and 1:6", "12/0003: 1:6 and 1:2")
+    return lab.check(scene, images)
 
 
-def test_a_wrong_pitch_is_named(full_scene, lab):
+def of_wider_pitch(scene, lab):
     """0.1 % on the board: no residual sees it, the target's design does."""
-    board = replace(full_scene.board, pitch_mm=1.001 * full_scene.board.pitch_mm)
-    checks = lab.check(full_scene, lab.observe(full_scene), board=board)
-    assert not_passed(checks) == {"pitch": "failed"}
-    assert checks["pitch"].names == ("board pitch",)
-    assert checks["pitch"].measured[0].value == pytest.approx(1000, abs=250)
+    return lab.check(scene, lab.observe(scene), board=replace(scene.board, pitch_mm=1.001 * scene.board.pitch_mm))
 
 
-def test_radii_of_another_design_are_no_wrong_pitch(full_scene, lab):
-    """All circles of the faces 8 % larger: their slope says 8 %, and their places that the pitch is right."""
-    checks = lab.check(full_scene, lab.reshaped(full_scene, lambda image: np.where(on_face(image), 1.08, 1.0)))
-    assert not_passed(checks) == {"radius-design": "failed"}
+def of_sizes(factor):
+    """``factor`` : on the radii of the circles of an image, as they are seen."""
+    return lambda scene, lab: lab.check(scene, lab.reshaped(scene, lambda image: factor(scene, image)))
+
+
+def behind_rims(scene, image):
+    """0.6 mm before all circles: their radii are smaller than designed, and are no fault of their own."""
+    _, _, radius, tilt_rad = seen_circles(scene, image)
+    return 1 - on_face(image) * lost_radius_mm(0.6, np.tan(tilt_rad), radius) / radius
+
+
+def out_of_plane(scene, lab):
+    normal = scene.target_from_face["4"].rotation[:, 2]
+    circles = scene.circles_target | {"4:6": scene.circles_target["4:6"] + 0.2 * normal}
+    scene = replace(scene, circles_target=circles)
+    return lab.check(scene, lab.observe(scene))
+
+
+def of_wrong_intrinsics(scene, lab):
+    parameters = scene.camera.parameters().copy()
+    parameters[:2] *= 1.0003
+    parameters[2:4] += 2
+    parameters[4] *= 1.01
+    return lab.check(scene, lab.observe(scene), scene.camera.with_parameters(parameters))
+
+
+def of_a_bad_row(scene, lab):
+    """Row 2 stretched by 0.05 % and stated nowhere: ±60 µm at its ends."""
+    groups = {}
+    for name, group in scene.groups.items():
+        dots = group.target_from_board.inverse() @ group.board_circles_target
+        dots[2 * 9 : 3 * 9, 0] += 5e-4 * (dots[2 * 9 : 3 * 9, 0] - 120)
+        groups[name] = replace(group, board_circles_target=group.target_from_board @ dots)
+    scene = replace(scene, groups=groups)
+    return lab.check(scene, lab.observe(scene))
+
+
+PLANTED = {
+    # What is planted; the check that says so, whether it is the only one, its verdict, names and largest values.
+    "labels exchanged": (exchanged, "labels", False, "failed", r"12/0003: 1:(2 and 1:6|6 and 1:2)", {}),
+    "pitch": (of_wider_pitch, "pitch", True, "failed", "^board pitch$", {"board pitch": (1000, 250)}),
+    # All circles of the faces 8 % larger: their slope says 8 %, and their places that the pitch is right.
+    "all radii": (of_sizes(lambda _, i: np.where(on_face(i), 1.08, 1.0)), "radius-design", True, "failed", "", {}),
+    "a radius": (
+        of_sizes(lambda _, image: np.where([label == "1:4" for label in image.labels], 1.03, 1.0)),
+        *("radius", False, "failed", "^1:4$", {"1:4": (240, 5)}),
+    ),
+    "rims": (of_sizes(behind_rims), "rim", True, "suspicious", "", {"circles of the faces": (600, 30)}),
+    "plane": (out_of_plane, "flatness", False, "failed", "4:6", {"4:6": (200, 20)}),
+    "intrinsics": (of_wrong_intrinsics, "camera", False, "failed", "^camera$", {"fx": (-1.67, 0.8), "cx": (-2, 1)}),
+    "row": (of_a_bad_row, "board-lines", False, "failed", "^group .. row 2( group .. row 2)*$", {}),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_fault_is_named_with_its_size(full_scene, lab, name):
+    plant, key, alone, verdict, names, values = PLANTED[name]
+    checks = plant(full_scene, lab)
+    assert checks[key].verdict == verdict
+    assert not_passed(checks) == {key: verdict} or not alone
+    assert re.match(names, " ".join(checks[key].names))
+    found = {row.name: row.value for row in checks[key].measured}
+    for row, (value, off) in values.items():
+        assert found[row] == pytest.approx(value, abs=off)
 
 
 @pytest.mark.parametrize(("blur_px", "as_sharp"), [(0.76, True), (4.0, False)])
@@ -172,18 +226,6 @@ def test_radii_may_be_off_by_what_blur_moves_a_bent_edge(small_result, blur_px, 
     )
     before, after = ({row.name: row.limit for row in rows}["circles of radius 4 mm"] for rows in (plain, blurred))
     assert (after == before) if as_sharp else (10 < after / before < 40)
-
-
-def test_a_rim_is_said_alone(full_scene, lab):
-    """0.6 mm before all circles: their radii are smaller than designed because of it, and are no fault of their own."""
-
-    def left(image):
-        _, _, radius, tilt_rad = seen_circles(full_scene, image)
-        return 1 - on_face(image) * lost_radius_mm(0.6, np.tan(tilt_rad), radius) / radius
-
-    checks = lab.check(full_scene, lab.reshaped(full_scene, left))
-    assert not_passed(checks) == {"rim": "suspicious"}
-    assert checks["rim"].measured[0].value == pytest.approx(600, rel=0.05)
 
 
 @pytest.mark.parametrize(("stated", "caught"), [(5, {"sharpness": "suspicious"}), (1, {"image-residuals": "failed"})])
@@ -286,50 +328,6 @@ def test_an_adjustment_that_has_not_settled_is_flagged(lab, monkeypatch):
     assert checks["agreement"].remedy
 
 
-def test_a_circle_out_of_its_plane_is_named(full_scene, lab):
-    normal = full_scene.target_from_face["4"].rotation[:, 2]
-    circles = full_scene.circles_target | {"4:6": full_scene.circles_target["4:6"] + 0.2 * normal}
-    scene = replace(full_scene, circles_target=circles)
-    check = lab.check(scene, lab.observe(scene))["flatness"]
-    assert check.verdict == "failed"
-    assert check.names[0] == "4:6"
-    assert check.measured[0].value == pytest.approx(200, rel=0.1)
-
-
-def test_wrong_intrinsics_name_the_camera(full_scene, lab):
-    parameters = full_scene.camera.parameters().copy()
-    parameters[:2] *= 1.0003
-    parameters[2:4] += 2
-    parameters[4] *= 1.01
-    check = lab.check(full_scene, lab.observe(full_scene), full_scene.camera.with_parameters(parameters))["camera"]
-    assert check.verdict == "failed"
-    assert check.names == ("camera",)
-    by_name = {m.name: m.value for m in check.measured}
-    assert by_name["fx"] == pytest.approx(-1.67, abs=0.8)
-    assert by_name["cx"] == pytest.approx(-2, abs=1)
-
-
-def test_a_circle_of_another_radius_is_named(full_scene, lab):
-    larger = lab.reshaped(full_scene, lambda image: np.where([label == "1:4" for label in image.labels], 1.03, 1.0))
-    checks = lab.check(full_scene, larger)
-    assert (checks["radius"].verdict, checks["radius"].names) == ("failed", ("1:4",))
-    assert checks["radius"].measured[0].value == pytest.approx(240, rel=0.02)
-
-
-def test_a_bad_row_of_the_board_is_named(full_scene, lab):
-    """Row 2 stretched by 0.05 % and stated nowhere: ±60 µm at its ends."""
-    groups = {}
-    for name, group in full_scene.groups.items():
-        board_from_target = group.target_from_board.inverse()
-        dots = board_from_target @ group.board_circles_target
-        dots[2 * 9 : 3 * 9, 0] += 5e-4 * (dots[2 * 9 : 3 * 9, 0] - 120)
-        groups[name] = replace(group, board_circles_target=group.target_from_board @ dots)
-    scene = replace(full_scene, groups=groups)
-    check = lab.check(scene, lab.observe(scene))["board-lines"]
-    assert check.verdict == "failed"
-    assert {name.split(" ", 2)[2] for name in check.names} == {"row 2"}
-
-
 def test_a_run_of_photographs_passes(small_run):
     checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
     assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
@@ -396,3 +394,70 @@ def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(l
     assert checks["groups"].verdict == verdict
     larger = max(check.enlarges for check in checks.values())
     assert (1.2 < larger <= MOST_ENLARGED) == (verdict == "suspicious")
+
+
+SHIFT_PX = 0.02
+
+
+class Group:
+    """Five images of a group, their centres exact, and the check of it."""
+
+    def __init__(self, scene, labels_only):
+        seen = labels_only.observations(scene, 0.003, np.random.default_rng(0))
+        self.images = [o for o in seen if o.group == "12"]
+        self.camera = scene.camera
+        (model,) = labels_only.models(scene, self.images)
+        self.network = free_network(model.metric(Similarity(1.0, Rigid())), scene.camera)
+
+    def check(self, uneven):
+        """``uneven`` : whether a circle is, of its label and the image's number."""
+        images = []
+        for i, image in enumerate(self.images):
+            shift = [[0.6 * SHIFT_PX, 0.8 * SHIFT_PX] if uneven(label, i) else [0, 0] for label in image.labels]
+            images.append(replace(image, uneven_px=np.array(shift)))
+        calibration = SimpleNamespace(camera=self.camera)
+        return evenness_check(
+            SimpleNamespace(networks=[self.network], images=images, calibration=calibration, radius_mm={"any": 1.0})
+        )
+
+    def in_all(self):
+        return sorted(set.intersection(*(set(image.labels) for image in self.images)))
+
+
+@pytest.fixture(scope="module")
+def group(scene, labels_only):
+    return Group(scene, labels_only)
+
+
+def test_even_circles_pass_and_half_of_every_circle_darker_is_suspicious_and_no_failure(group):
+    """A shift of 0.02 px at the circle's distance, 0.9 to 1.4 m with 2787 px of focal length: 6 to 10 µm."""
+    check = group.check(lambda label, i: False)
+    assert (check.verdict, check.names, check.remedy) == ("passed", (), "")
+    assert check.tested == len({label for image in group.images for label in image.labels})
+    assert check.measured[0].value == 0
+    check = group.check(lambda label, i: True)
+    assert check.verdict == "suspicious"
+    assert set(group.in_all()) <= set(check.names)
+    depth = group.network.model.xyz_camera()[:, 2]
+    low, high = 1e3 * SHIFT_PX * np.array([depth.min(), depth.max()]) / np.sqrt(group.camera.focal.prod())
+    assert all(low <= m.value <= high for m in check.measured)
+    assert check.measured[0].unit == "µm"
+    assert "shade them from glare" in check.remedy
+
+
+@pytest.mark.parametrize(("views", "verdict"), [(1, "passed"), (2, "passed"), (3, "suspicious"), (5, "suspicious")])
+def test_one_circle_is_suspected_by_how_often_it_is_uneven(group, views, verdict):
+    """By chance one centre in a hundred: of five views two are once in a thousand, among 80 circles no wonder; three
+    are once in 100 000 circles."""
+    own = group.in_all()[7]
+    check = group.check(lambda label, i: label == own and i < views)
+    assert check.verdict == verdict
+    assert check.names == ((own,) if verdict == "suspicious" else ())
+
+
+@pytest.mark.slow
+def test_chance_alone_is_suspected_as_rarely_as_promised(group):
+    """One verdict in a thousand; of 150 three would be chance once in 2000 (Poisson, 0.15)."""
+    rng = np.random.default_rng(1)
+    verdicts = [group.check(lambda label, i: rng.random() < UNEVEN_BY_CHANCE).verdict for _ in range(150)]
+    assert verdicts.count("suspicious") < 3

@@ -44,7 +44,7 @@ def client(tracker, **options) -> TestClient:
     return TestClient(LiveService(tracker, **options).app, "http://127.0.0.1:8765")
 
 
-def test_an_answer_is_that_of_measure(tracker, small_dataset, tmp_path):
+def test_an_answer_is_that_of_measure_or_the_reason_why_there_is_none(tracker, small_dataset, tmp_path):
     photograph = min((small_dataset / "images" / "12").iterdir())
     (tmp_path / photograph.name).symlink_to(photograph)
     own = poses_file(measure(tmp_path, tracker.model, tracker.target, options=MeasureOptions(workers=1))).content()
@@ -52,6 +52,10 @@ def test_an_answer_is_that_of_measure(tracker, small_dataset, tmp_path):
     assert answer.status_code == 200
     assert answer.json() == own
     assert tracker.recent == ()  # no image depends on another one
+    grey = np.full((tracker.model.height, tracker.model.width), 90, np.uint8)
+    answer = client(tracker).post("/pose?name=wall.png", content=png(grey))
+    assert (answer.status_code, answer.json()["images"]) == (422, [])
+    assert answer.json()["left_out"][0]["name"] == "wall.png"
 
 
 def png(image) -> bytes:
@@ -79,13 +83,6 @@ def huge() -> bytes:
 def test_what_is_no_image_of_this_camera(tracker, data, status, code):
     answer = client(tracker, max_megabytes=1.0).post("/pose", content=data)
     assert (answer.status_code, answer.json()["code"]) == (status, code)
-
-
-def test_an_image_without_the_target_has_a_reason(tracker):
-    grey = np.full((tracker.model.height, tracker.model.width), 90, np.uint8)
-    answer = client(tracker).post("/pose?name=wall.png", content=png(grey))
-    assert (answer.status_code, answer.json()["images"]) == (422, [])
-    assert answer.json()["left_out"][0]["name"] == "wall.png"
 
 
 OWN, EVIL = "127.0.0.1:8765", "evil.example:8765"
@@ -137,11 +134,8 @@ def test_each_message_has_a_picture_with_its_pose_or_the_reason_why_not(tracker,
     last, end = TestClient(service.app, f"http://{OWN}").get("/events").text.split("\n\n")[:2]
     assert json.loads(last.removeprefix("data: ")) == service.newest
     assert end.startswith("event: ended")
-
-
-def test_pictures_of_another_size_end_it(tracker, photograph):
     with fails_with("E-IMAGE-SIZE"):
-        next(LiveService(tracker).follow([photograph[::2, ::2]], tracker))
+        next(service.follow([photograph[::2, ::2]], tracker))
 
 
 def test_the_extra_that_is_missing_is_named(monkeypatch):
@@ -244,16 +238,11 @@ def test_pages_get_the_newest_picture_and_the_last_one_before_the_end():
     line.close()
 
 
-@pytest.mark.parametrize(
-    ("host", "code"),
-    [("0.0.0.0", "E-OPTION-NEEDS … --host 0.0.0.0 … --token"), ("999.1.1.1", "E-SERVICE-ADDRESS … --host 999.1.1.1")],
-)
-def test_addresses_at_which_none_listens(host, code):
-    with fails_with(code), served(LiveService(None), host, 0):
-        pass
-
-
-def test_a_port_that_is_taken_and_other_machines_with_a_token():
+def test_addresses_at_which_none_listens_and_other_machines_with_a_token():
+    needs, unknown = "E-OPTION-NEEDS … --host 0.0.0.0 … --token", "E-SERVICE-ADDRESS … --host 999.1.1.1"
+    for host, code in (("0.0.0.0", needs), ("999.1.1.1", unknown)):
+        with fails_with(code), served(LiveService(None), host, 0):
+            pass
     with served(LiveService(None, token="word"), "0.0.0.0", 0) as url:
         port = int(url.rpartition(":")[2])
         assert asked(port, "POST", "/pose", b"x")[0] == 401

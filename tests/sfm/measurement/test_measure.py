@@ -167,9 +167,8 @@ def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
     error = pose_error(pose.camera_from_target, truth)
     assert np.abs(error[:3]).max() < 1e-9
     assert np.abs(error[3:]).max() < 1e-6
-    turned = pose_from_circles(
-        image.select(np.random.default_rng(0).permutation(len(image))), known.truth, scene.camera
-    )
+    other_order = image.select(np.random.default_rng(0).permutation(len(image)))
+    turned = pose_from_circles(other_order, known.truth, scene.camera)
     assert np.abs(pose_error(turned.camera_from_target, pose.camera_from_target)).max() < 1e-9
     assert turned.labels == pose.labels
 
@@ -221,9 +220,8 @@ def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
 def test_too_few_circles_and_wrong_labels(scene, known):
     _, _, image = one_view(scene, np.random.default_rng(11), ("2",), NOISE_PX, (20, 40), (900, 1000))
     for count in (0, 1, 3):
-        refuses(
-            "E-MEASURE-FEW-CIRCLES … 4", pose_from_circles, image.select(list(range(count))), known.truth, scene.camera
-        )
+        few = image.select(list(range(count)))
+        refuses("E-MEASURE-FEW-CIRCLES … 4", pose_from_circles, few, known.truth, scene.camera)
     with fails_with("E-MEASURE-AMBIGUOUS … not on one line"):  # circles 1, 2, 3 and a lie in line
         pose_from_circles(image.select([image.labels.index(f"2:{c}") for c in "123a"]), known.truth, scene.camera)
     _, _, both = one_view(scene, np.random.default_rng(11), ("1", "2"), NOISE_PX, (20, 30), (900, 1000))
@@ -240,8 +238,9 @@ def test_too_few_circles_and_wrong_labels(scene, known):
         pose_from_circles(replace(image, covariance_px2=0 * image.covariance_px2), known.truth, scene.camera)
 
 
-def test_faces_json_holds_the_covariance_of_all_circles_together(small_run):
-    """Its blocks are the 3×3 that are there too; the reference face's origin has no error in its own plane."""
+def test_faces_json_holds_the_covariance_of_all_circles_together(small_run, tmp_path):
+    """Its blocks are the 3×3 that are there too; the reference face's origin has no error in its own plane. What an
+    older file lacks is said."""
     content = json.loads((small_run / "faces.json").read_text())
     target = read_target(small_run / "faces.json", reference_target())
     assert target.notes == ()
@@ -253,6 +252,14 @@ def test_faces_json_holds_the_covariance_of_all_circles_together(small_run):
     assert np.abs(target.covariance[3 * i : 3 * i + 2]).max() < 1e-12
     across = target.covariance[3 * j : 3 * j + 3, 3 * j + 3 : 3 * j + 6]
     assert np.trace(across) > 1e-7  # neighbours err together
+
+    def older(content):
+        del content["circles_joint_covariance_mm2"], content["centre_sigma_factor"]
+
+    target = read_spoilt(small_run, tmp_path, older)
+    assert any("covariances between circles" in note for note in target.notes)
+    assert any("no centre_sigma_factor" in note for note in target.notes)
+    assert np.abs(target.covariance[:3, 3:]).max() == 0 < np.trace(target.covariance)
 
 
 def command(small_dataset, small_run, tmp_path, *more, faces=None):
@@ -298,20 +305,15 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     assert "no face of the target recognised" in (tmp_path / "poses.html").read_text()
 
 
-def spoilt(small_run, tmp_path, change):
+def read_spoilt(small_run, tmp_path, change):
     content = json.loads((small_run / "faces.json").read_text())
     change(content)
-    path = tmp_path / "faces.json"
-    path.write_text(json.dumps(content))
-    return path
+    (tmp_path / "faces.json").write_text(json.dumps(content))
+    return read_target(tmp_path / "faces.json", reference_target())
 
 
-def other_place(content):
-    content["circles"]["2:7"][0] += 5.0
-
-
-def negative_variance(content):
-    content["circles_joint_covariance_mm2"]["upper_triangle"][0] -= 1.0
+def less(values, by):
+    values[0] -= by
 
 
 def other_circle(content):
@@ -325,24 +327,17 @@ def other_circle(content):
     ("change", "message"),
     [
         (other_circle, r"circle 7:1 is not in target"),
-        (other_place, r"face 2 is 1\.\d+ mm RMS off that of target"),
+        (lambda content: less(content["circles"]["2:7"], -5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
         (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
-        (negative_variance, r"circles_joint_covariance_mm2: variance -1\S* of x of 1:"),
+        (
+            lambda content: less(content["circles_joint_covariance_mm2"]["upper_triangle"], 1.0),
+            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
+        ),
     ],
 )
 def test_faces_of_another_target_are_refused(small_run, tmp_path, change, message):
     with pytest.raises(InputError, match=message):
-        read_target(spoilt(small_run, tmp_path, change), reference_target())
-
-
-def test_what_the_covariance_lacks_is_said(small_run, tmp_path):
-    def older(content):
-        del content["circles_joint_covariance_mm2"], content["centre_sigma_factor"]
-
-    target = read_target(spoilt(small_run, tmp_path, older), reference_target())
-    assert any("covariances between circles" in note for note in target.notes)
-    assert any("no centre_sigma_factor" in note for note in target.notes)
-    assert np.abs(target.covariance[:3, 3:]).max() == 0 < np.trace(target.covariance)
+        read_spoilt(small_run, tmp_path, change)
 
 
 @pytest.mark.parametrize(
@@ -359,15 +354,6 @@ def test_other_joints_are_refused(scene, known, tmp_path, text, code):
     (tmp_path / "joints.csv").write_text(text)
     with fails_with(code):
         poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
-
-
-def test_images_without_a_face_are_an_error_together(stcal_sfm, small_dataset, small_run, tmp_path):
-    (tmp_path / "images").mkdir()
-    for i in range(2):
-        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((864, 1296), 90 + i, np.uint8))
-    code, _, err = stcal_sfm(*command(small_dataset, small_run, tmp_path))
-    assert code == 3
-    assert "no face of the target measured in 2 images" in err
 
 
 def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
@@ -404,13 +390,19 @@ def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
 
 
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):
-    """σ stated a hundred times too small; with their own σ the same images pass."""
+    """σ stated a hundred times too small; with their own σ the same images pass. Without a face there is an error."""
     words = command(small_dataset, small_run, tmp_path, "--strict")
     assert stcal_sfm(*words)[0] == 0
     code, _, err = stcal_sfm(*words, "--sigma-factor", 0.01, "--overwrite")
     assert code == 4
     assert "error: --strict: failed: χ² of " in err
     assert (tmp_path / "poses.csv").exists()
+    for i, photograph in enumerate((tmp_path / "images").iterdir()):
+        photograph.unlink()
+        cv2.imwrite(str(photograph.with_suffix(".png")), np.full((864, 1296), 90 + i, np.uint8))
+    code, _, err = stcal_sfm(*words, "--overwrite")
+    assert code == 3
+    assert "no face of the target measured in 2 images" in err
 
 
 SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])  # of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2
