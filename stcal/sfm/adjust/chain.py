@@ -210,10 +210,9 @@ class CalibratedTarget(Brief):
                 return {key: times(by, own) for key, own in values.items()}
             return None if values is None else by * values
 
-        linear, square = ("distance_sigma_mm", "scale_sigma", "position_sources_mm"), factor**2
-        covariances = ("face_covariance", "circle_covariance", "covariance_mm2")
-        larger = {name: times(factor, getattr(self, name)) for name in linear}
-        return replace(self, **larger, **{name: times(square, getattr(self, name)) for name in covariances})
+        grown = dict.fromkeys(("distance_sigma_mm", "scale_sigma", "position_sources_mm"), factor)
+        grown |= dict.fromkeys(("face_covariance", "circle_covariance", "covariance_mm2"), factor**2)
+        return replace(self, **{name: times(by, getattr(self, name)) for name, by in grown.items()})
 
 
 def chain_faces(

@@ -69,9 +69,8 @@ def radius_views(
     rows = model.rows_by_image()
     order = np.concatenate(rows)
     seen = [(images[name], model.keypoint[own]) for name, own in zip(model.images, rows, strict=True)]
-    shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
-    blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
-    domes = np.concatenate([image.domes[keypoint] for image, keypoint in seen])
+    names = "shape", "blur_px", "domes"
+    shape, blur, domes = (np.concatenate([getattr(own, name)[k] for own, k in seen]) for name in names)
     point = model.point_index[order]
     is_circle = np.array([label in design_mm for label in model.labels])[point]  # corners have no radius
     radius = np.array([design_mm.get(label, 1.0) for label in model.labels])[point]

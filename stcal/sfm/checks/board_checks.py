@@ -16,7 +16,7 @@ from stcal.labels import DotLabel, Label, dot_cells
 from stcal.sfm.adjust.refine import MIN_DOTS, Network, known_points
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
 from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
-from stcal.sfm.checks.significance import MICRO, Evidence, Trial, assess
+from stcal.sfm.checks.significance import MICRO, Evidence, Trial, assess, weight_beside
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05  # σ of the bias that light, lens and threshold add to all radii alike; it moves no centre
@@ -165,11 +165,7 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     turn = np.kron(np.eye(len(dots)), board_from_model.scale * board_from_model.rigid.rotation)
     of_images = network.noise() * network.covariance_of(dots)
     covariance = turn @ of_images @ turn.T + board.sigma_mm**2 * np.eye(3 * len(dots))
-    free = free_motions(design, scale=True)
-    # The similarity is eliminated as an unknown, so that the weights annihilate it.
-    inverse = np.linalg.inv(covariance)
-    along = inverse @ free
-    weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
+    weight = weight_beside(covariance, free_motions(design, scale=True))
     return (board_from_model @ xyz - design).ravel(), weight, cells
 
 

@@ -19,7 +19,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.refine import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, widened_result
-from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess
+from stcal.sfm.checks.significance import MICRO, Evidence, Guilt, Trial, assess, weight_beside
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
@@ -265,7 +265,5 @@ def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np
     covariance = network.noise() * across @ network.covariance_of(members) @ across.T
     basis = np.linalg.svd(np.eye(3) - np.outer(plane.normal, plane.normal))[0][:, :2]
     free = np.column_stack([np.ones(len(members)), (xyz - xyz.mean(0)) @ basis])
-    inverse = np.linalg.inv(covariance)
-    along = inverse @ free
-    weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
-    return tuple(model.labels[i] for i in members), xyz @ plane.normal - plane.offset, weight
+    labels = tuple(model.labels[i] for i in members)
+    return labels, xyz @ plane.normal - plane.offset, weight_beside(covariance, free)

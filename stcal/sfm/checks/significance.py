@@ -250,6 +250,13 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
     return Guilt(where, tuple(names[i] for i in out))
 
 
+def weight_beside(covariance: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Returns the weight matrix (k, k) of values in which ``free`` (k, f), directions of further unknowns, weigh 0."""
+    inverse = np.linalg.inv(covariance)
+    along = inverse @ free
+    return inverse - along @ np.linalg.solve(free.T @ along, along.T)
+
+
 def on_face(model: GroupModel) -> np.ndarray:
     """Returns which points of a model are those of faces, (p,)."""
     return np.array([isinstance(label, CircleLabel) for label in model.labels])
