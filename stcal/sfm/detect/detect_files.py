@@ -11,10 +11,9 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -41,22 +40,24 @@ from stcal.io.images import (
     thumbnail,
     without_excluded,
 )
-from stcal.labels import parse_label, parse_labels
+from stcal.labels import CircleLabel, DotLabel, parse_label
 from stcal.sfm.data.group_model import Centres, Note
 from stcal.sfm.detect.candidates import BoardSighting, EllipseOptions, FaceSighting, ImageDetection
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 
-CACHE_VERSION = 12
+CACHE_VERSION = 13
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 PHOTOGRAPHS = "the photographs"  # where a camera that was found is from, for messages
 LOSSY = (".jpg", ".jpeg")
 COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)  # in names, by file managers
+KEPT: dict[str, Callable] = {"dict": lambda *pairs: dict(pairs), "label": parse_label}
+KEPT |= {kind.__name__: kind for kind in (BoardSighting, Centres, FaceSighting, ImageDetection, Note, SecondLook)}
+"""What makes the parts of cached results, by the name of their type."""
 SAME_PLACE_PX = 4.0
 SAME_SHARE = 0.6  # share of an image's circles that lie within the same squares of that side in another form of it
 
-P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
 """Type of functions that detect circles in one grey image."""
 
@@ -191,7 +192,9 @@ def _detect_file(
         return Skipped(file.name, str(error), *(["distortion"] if isinstance(error, ConvergenceError) else []))
     digest, key = _key(data, settings)
     picture, scale = thumbnail(grey_8bit(image)) if pictures else (np.zeros(0, np.uint8), 1.0)
-    return key, _packed(detection, key, digest, picture, scale)
+    arrays = {"thumbnail": picture}
+    meta = {"detection": _plain(detection, arrays), "digest": digest, "scale": scale}
+    return key, packed(key, arrays, meta)
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
@@ -210,41 +213,35 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
-def _arrays(kind: str, *parts: Centres | FaceSighting | BoardSighting) -> dict[str, np.ndarray]:
-    """Returns the arrays of dataclasses of one type by name, for :func:`_part`."""
-    named = {f"{kind}_{i}_{f.name}": getattr(part, f.name) for i, part in enumerate(parts) for f in fields(part)}
-    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+def _plain(value, arrays: dict[str, np.ndarray]):
+    """Returns a result as JSON can hold it, with its arrays by their names in ``arrays``; :func:`_whole` undoes it."""
+    if isinstance(value, np.ndarray):
+        arrays[name := str(len(arrays))] = value
+        return {"array": name}
+    if isinstance(value, CircleLabel | DotLabel):
+        return {"label": [str(value)]}
+    if isinstance(value, Note):
+        return {"Note": [value.words, value.code, value.place, value.remedy]}
+    if isinstance(value, dict):
+        return {"dict": [_plain(pair, arrays) for pair in value.items()]}
+    if is_dataclass(value):
+        return {type(value).__name__: [_plain(getattr(value, f.name), arrays) for f in fields(value)]}
+    return [_plain(each, arrays) for each in value] if isinstance(value, tuple) else value
 
 
-def _part(stored, kind: str, i: int, make: type[P], *first: str) -> P:
-    """Returns part ``i`` of :func:`_arrays`, of the class ``make``; ``first`` : its fields that are no arrays."""
-    return make(*first, *(stored[f"{kind}_{i}_{f.name}"] for f in fields(make)[len(first) :]))
-
-
-def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarray, scale: float) -> bytes:
-    arrays = {"thumbnail": picture} | _arrays("centres", detection.centres) | _arrays("board", *detection.boards)
-    faces = (detection.faces, detection.printed, *detection.open_faces)
-    for k, sightings in enumerate(faces):
-        arrays |= _arrays(f"faces_{k}", *sightings)
-    meta = {name: getattr(detection, name) for name in ("mirrored", "notes", "candidates")}
-    meta |= {"digest": digest, "scale": scale, "boards": len(detection.boards)}
-    meta["faces"] = [[sighting.face for sighting in sightings] for sightings in faces]
-    return packed(key, arrays, meta)
+def _whole(plain, arrays: Mapping[str, np.ndarray]):
+    if isinstance(plain, dict):
+        ((kind, content),) = plain.items()
+        return arrays[content] if kind == "array" else KEPT[kind](*_whole(content, arrays))
+    return tuple(_whole(each, arrays) for each in plain) if isinstance(plain, list) else plain
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     """Loads a cached result; None if there is none, or the file is not as it was saved."""
 
     def make(stored, meta) -> DetectedImage:
-        faces, printed, *open_faces = (
-            tuple(_part(stored, f"faces_{k}", i, FaceSighting, face) for i, face in enumerate(names))
-            for k, names in enumerate(meta["faces"])
-        )
-        boards = tuple(_part(stored, "board", i, BoardSighting) for i in range(meta["boards"]))
-        centres, mirrored, notes = _part(stored, "centres", 0, Centres), tuple(meta["mirrored"]), tuple(meta["notes"])
-        seen = faces, boards, mirrored, notes, meta["candidates"], tuple(open_faces), printed
-        picture = stored["thumbnail"].tobytes()
-        return DetectedImage(file, ImageDetection(centres, *seen), meta["digest"], picture, meta["scale"], reused)
+        detection, picture = _whole(meta["detection"], stored), stored["thumbnail"].tobytes()
+        return DetectedImage(file, detection, meta["digest"], picture, meta["scale"], reused)
 
     return kept(path, make)
 
@@ -266,15 +263,16 @@ def look_again(
         for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
             hasher.update(values.tobytes())
         path = cache / f"again-{hasher.hexdigest()[:40]}.npz"
-        if known := kept(path, _stored_look):
+        if known := kept(path, lambda stored, meta: _whole(meta["look"], stored)):
             looks[image.file.name] = known
         else:
             pending.append((image.file, camera, predicted, options))
             paths.append(path)
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
-            missed = {a: {"words": n.words, "code": n.code, "remedy": n.remedy} for a, n in look.missed.items()}
-            keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": missed})
+            arrays: dict[str, np.ndarray] = {}
+            meta = {"look": _plain(look, arrays)}
+            keep(paths[k], arrays, meta)
             looks[pending[k][0].name] = look
     return looks
 
@@ -282,11 +280,6 @@ def look_again(
 def _look_again(file: ImageFile, camera: Camera, *searched) -> SecondLook | None:
     loaded = load_image(file, camera, "")
     return None if isinstance(loaded, Skipped) else measure_predicted(loaded[1], camera, *searched)
-
-
-def _stored_look(stored, meta) -> SecondLook:
-    missed = {parse_label(label): Note(**note) for label, note in meta["missed"].items()}
-    return SecondLook(parse_labels(meta["labels"]), _part(stored, "centres", 0, Centres), missed)
 
 
 def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:

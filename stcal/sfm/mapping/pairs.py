@@ -9,7 +9,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError, MappingError
@@ -223,15 +223,16 @@ def image_graph(
     members = rows_by(image.group for image in observations)
     if kind == "all":
         return ImageGraph(kind, np.argwhere(np.triu(shared, 1) >= MIN_SHARED), members)
-    skeleton, pairs = {}, set()
+    skeleton, joined = {}, np.zeros(shared.shape, bool)
     for name, indices in members.items():
         direction = np.array([_direction(observations[i], board) for i in indices])
         chosen = _skeleton(direction, sees[indices])
         skeleton[name] = indices[chosen]
-        pairs |= {(i, j) for i, j in combinations(skeleton[name].tolist(), 2) if shared[i, j] >= MIN_SHARED}
-        pairs |= _links(indices, chosen, direction, sees, shared)
-    _join_tracks(pairs, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
-    return ImageGraph(kind, np.array(sorted(pairs), int).reshape(-1, 2), skeleton)
+        among = np.ix_(indices[chosen], indices[chosen])
+        joined[among] = shared[among] >= MIN_SHARED
+        _join_neighbours(joined, indices, chosen, direction, sees, shared)
+    _join_tracks(joined, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
+    return ImageGraph(kind, np.argwhere(np.triu(joined, 1)), skeleton)
 
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:
@@ -279,9 +280,9 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return np.sort(chosen)
 
 
-def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
-    """Returns pairs of the group's other images with skeleton images: the nearest, and those their circles need."""
-    pairs, skeleton = set(), indices[chosen]
+def _join_neighbours(joined: np.ndarray, indices, chosen, direction, seen, shared) -> None:
+    """Joins the group's other images with skeleton images: the nearest, and those their circles need."""
+    skeleton = indices[chosen]
     for k in np.setdiff1d(np.arange(len(indices)), chosen):
         i = indices[k]
         near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
@@ -290,36 +291,21 @@ def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
         picked = list(order[:NEIGHBOURS])
         open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
         while open_labels.any():
-            best = max(order, key=lambda j: int((seen[j] & open_labels).sum()))
-            picked.append(best)
-            open_labels &= ~seen[best]
-        pairs |= {(int(min(i, j)), int(max(i, j))) for j in picked}
-    return pairs
+            picked.append(max(order, key=lambda j: int((seen[j] & open_labels).sum())))
+            open_labels &= ~seen[picked[-1]]
+        joined[i, picked] = joined[picked, i] = True
 
 
-def _join_tracks(pairs: set[tuple[int, int]], seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:
-    """Adds pairs until the images of every circle are as connected as all pairs would make them."""
-    for column in range(seen.shape[1]):
-        images = np.flatnonzero(seen[:, column])
-        component = track_parts(np.array(sorted(pairs), int).reshape(-1, 2), images)
-        for allowed in (preferred[images], np.ones(len(images), bool)):
-            if component.max(initial=0) == 0:
-                break
-            usable = np.flatnonzero(allowed)
-            i, j = np.triu_indices(len(usable), 1)
-            i, j = usable[i], usable[j]
-            count = shared[images[i], images[j]]
-            useful = np.flatnonzero((component[i] != component[j]) & (count >= MIN_SHARED))
-            for k in useful[np.argsort(-count[useful], kind="stable")]:
-                a, b = component[i[k]], component[j[k]]
-                if a != b:
-                    component[component == max(a, b)] = min(a, b)
-                    pairs.add((int(images[i[k]]), int(images[j[k]])))
-
-
-def track_parts(pairs: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Returns the connected component of each of the ``images`` (ascending) in the graph of ``pairs`` among them."""
-    inside = np.isin(pairs, images).all(1)
-    i, j = np.searchsorted(images, pairs[inside]).T
-    matrix = coo_array((np.ones(len(i)), (i, j)), shape=(len(images), len(images)))
-    return connected_components(matrix, directed=False)[1]
+def _join_tracks(joined: np.ndarray, seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:
+    """Joins images until those of every circle are as connected as all pairs would make them: ``preferred`` ones first,
+    then those with most labels in common."""
+    for images in map(np.flatnonzero, seen.T):
+        among = np.ix_(images, images)
+        if connected_components(joined[among], directed=False)[0] == 1:
+            continue
+        i, j = np.nonzero(np.triu(joined[among] | (shared[among] >= MIN_SHARED), 1))
+        a, b = images[i], images[j]
+        order = np.lexsort((-shared[a, b], ~(preferred[a] & preferred[b]), ~joined[a, b]))
+        graph = coo_array((1.0 + np.argsort(order), (i, j)), shape=(len(images), len(images)))
+        a, b = minimum_spanning_tree(graph).nonzero()
+        joined[images[a], images[b]] = True

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.detect.labelling import LabelledImage
@@ -21,7 +22,6 @@ from stcal.sfm.mapping.pairs import (
     SPARSE_FROM,
     image_graph,
     incidence,
-    track_parts,
 )
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import Groups, Task, map_groups
@@ -59,9 +59,11 @@ def solve(scene, observations, kind, out):
 
 def require_same_tracks(scene, images) -> None:
     """Images of a track share a number, whatever the numbers are."""
-    every, sparse = (image_graph(images, scene.board, kind).pairs for kind in ("all", "sparse"))
-    for column in incidence(images).T:
-        a, b = (track_parts(pairs, np.flatnonzero(column)) for pairs in (every, sparse))
+    joined = np.zeros((2, len(images), len(images)), bool)
+    for own, kind in zip(joined, ("all", "sparse"), strict=True):
+        own[tuple(image_graph(images, scene.board, kind).pairs.T)] = True
+    for own in map(np.flatnonzero, incidence(images).T):
+        a, b = (connected_components(each[np.ix_(own, own)], directed=False)[1] for each in joined)
         np.testing.assert_array_equal(a[:, None] == a, b[:, None] == b)
 
 
