@@ -17,7 +17,7 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
@@ -208,6 +208,11 @@ class GroupModel(Measured):
         order = np.argsort(self.image_index, kind="stable")
         return np.split(order, np.searchsorted(self.image_index[order], np.arange(1, len(self.images))))
 
+    def seen(self) -> list[tuple[str, Label]]:
+        """Returns the names of image and label of each observation."""
+        rows = zip(self.image_index.tolist(), self.point_index.tolist(), strict=True)
+        return [(self.images[i], self.labels[p]) for i, p in rows]
+
     def keypoints_px(self, image: ImageObservations, rows: np.ndarray) -> np.ndarray:
         """Returns all keypoints of one image, (k, 2): corrected if in the model (``rows``), else measured."""
         xy = image.centre_px.copy()
@@ -216,9 +221,7 @@ class GroupModel(Measured):
 
     def xyz_camera(self) -> np.ndarray:
         """Returns the observed points in the frames of the cameras that observe them, (n, 3)."""
-        rotation = np.stack([pose.rotation for pose in self.camera_from_model])[self.image_index]
-        translation = np.stack([pose.translation for pose in self.camera_from_model])[self.image_index]
-        return np.einsum("nij,nj->ni", rotation, self.xyz_model[self.point_index]) + translation
+        return Poses.of(self.camera_from_model)[self.image_index] @ self.xyz_model[self.point_index]
 
     def by_parameters(self, camera: Camera) -> np.ndarray:
         """Returns the derivatives of the projections (px) by the camera's parameters, (n, 2, 16)."""

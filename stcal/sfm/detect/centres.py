@@ -6,6 +6,7 @@ A rim is fitted to a band around it in the image, without pixels of neighbouring
 import numpy as np
 
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import singular_values
 from stcal.geometry.robust import robust_sigmas
 from stcal.sfm.data.group_model import Centres
 from stcal.sfm.detect.candidates import Ellipses
@@ -34,48 +35,16 @@ def intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> lis
     """Returns by ellipse the (relative centre, inverse shape) of other candidates that reach into its box."""
     reach = np.sqrt((neighbours.shape_px**2).sum(2))
     gap = np.abs(ellipses.centre_px[:, None] - neighbours.centre_px) - half[:, None] - reach
-    near = (gap < 0).all(2)
-    lists = []
-    for i in range(len(ellipses)):
-        found = []
-        for j in np.flatnonzero(near[i]):
-            between = neighbours.centre_px[j] - ellipses.centre_px[i]
-            square = between @ between
-            support = np.linalg.norm(ellipses.shape_px[i] @ between) + np.linalg.norm(neighbours.shape_px[j] @ between)
-            # Ellipses that overlap are the same blob, or one holds the other: supports along the line of centres.
-            if square > 1 and square > support - 2 * np.sqrt(square):
-                wider = neighbours.shape_px[j] + RIM_CLEARANCE_PX * np.eye(2)
-                found.append((between, np.linalg.inv(wider)))
-        lists.append(found)
-    return lists
-
-
-def offsets(low: np.ndarray, high: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns columns (w,) and rows (h, 1) of a box, px from ``place``."""
-    x, y = ((np.arange(a, b) - c).astype(np.float32) for a, b, c in zip(low, high, place, strict=True))
-    return x, y[:, None]
-
-
-def near_rim(
-    offset: tuple[np.ndarray, np.ndarray],  # the box's columns and rows, px from a place in it
-    on_unit: np.ndarray,  # (2, 2), takes the ellipse to the unit circle
-    centre: np.ndarray,  # (2,), px from that place
-    width: float,  # half width of the band, in the lengths that ``on_unit`` measures
-    # (centre from that place, inverse shape) of ellipses whose pixels are left out
-    beside: list[tuple[np.ndarray, np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rows and columns, in a box, of the pixels within a band around a rim."""
-    (dx, dy), inverse = offset, on_unit.astype(np.float32)
-    x, y = dx - np.float32(centre[0]), dy - np.float32(centre[1])
-    a, b = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
-    square = a * a + b * b
-    slope_x, slope_y = inverse[0, 0] * a + inverse[1, 0] * b, inverse[0, 1] * a + inverse[1, 1] * b
-    chosen = (square - np.sqrt(square)) ** 2 < (slope_x**2 + slope_y**2) * np.float32(width**2)
-    for place, shape in beside:
-        x, y = dx - np.float32(place[0]), dy - np.float32(place[1])
-        chosen &= (shape[0, 0] * x + shape[0, 1] * y) ** 2 + (shape[1, 0] * x + shape[1, 1] * y) ** 2 > 1
-    rows, columns = np.divmod(np.flatnonzero(chosen), chosen.shape[1])
-    return rows, columns
+    i, j = np.nonzero((gap < 0).all(2))
+    between = neighbours.centre_px[j] - ellipses.centre_px[i]
+    square = (between**2).sum(1)
+    shapes = np.stack([ellipses.shape_px[i], neighbours.shape_px[j]])
+    support = np.linalg.norm(shapes @ between[..., None], axis=2).sum((0, 2))
+    # Ellipses that overlap are the same blob, or one holds the other: supports along the line of centres.
+    beside = (square > 1) & (square > support - 2 * np.sqrt(square))
+    wider = np.linalg.inv(neighbours.shape_px[j] + RIM_CLEARANCE_PX * np.eye(2))
+    rows = [np.flatnonzero(beside & (i == own)) for own in range(len(ellipses))]
+    return [[(between[k], wider[k]) for k in own] for own in rows]
 
 
 BAND_BLURS = 4.0  # half width of the band of pixels, in units of the blur
@@ -105,12 +74,17 @@ class Fits:
     """The fits of n blurred ellipses side by side, ideal px. Pixels are rows of (n, …, m) arrays of single precision:
     coordinates are from each start; ``real`` is 0 behind the last pixel."""
 
-    def __init__(self, image, ellipses: Ellipses, half, to_ideal, intruders):
+    def __init__(self, image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses):
         n, place = len(ellipses), ellipses.centre_px
-        self.image, self.half, self.to_ideal, self.intruders = image, half, to_ideal, intruders
+        half = 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX  # of the boxes that the rims may move in
+        to_ideal = local_ideal_maps(camera, place, half)
+        self.image, self.half, self.to_ideal = image, half, to_ideal
+        self.intruders = intruders(ellipses, neighbours, half)
         self.low = np.maximum(np.floor(place - half).astype(int), 0)
         self.high = np.minimum(np.ceil(place + half).astype(int) + 1, image.shape[::-1])
-        self.offset = [offsets(*each) for each in zip(self.low, self.high, place, strict=True)]
+        # columns and rows of each box, px from its ellipse
+        boxes = zip(self.low.tolist(), self.high.tolist(), place, strict=True)
+        self.offset = [[(np.arange(*r) - c).astype(np.float32) for *r, c in zip(*box, strict=True)] for box in boxes]
         self.jacobian = to_ideal[:, :, 1:3] / half[:, None]
         m = self.jacobian @ ellipses.shape_px
         value, vector = np.linalg.eigh(m @ np.swapaxes(m, 1, 2))
@@ -209,9 +183,7 @@ class Fits:
         chosen = active[anew]
         self.band[chosen], self.selected[chosen] = wanted[anew], self.centre[chosen]
         for i in chosen.tolist():
-            centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
-            on_unit, width = self.inverse_shape[i] @ self.jacobian[i], float(self.band[i])
-            self.rows[i], self.columns[i] = near_rim(self.offset[i], on_unit, centre, width, self.intruders[i])
+            self.rows[i], self.columns[i] = self._near_rim(i)
         self._widen(max(map(len, self.rows), default=0))
         for i in chosen.tolist():
             self._take(i)
@@ -219,6 +191,21 @@ class Fits:
         few = np.array([len(self.rows[i]) < MIN_PIXELS for i in active], bool)
         self.failed[active[few]] = True
         return active[~few]
+
+    def _near_rim(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns rows and columns, in its box, of the pixels within the band around a rim, without intruders."""
+        (dx, dy), inverse = self.offset[i], (self.inverse_shape[i] @ self.jacobian[i]).astype(np.float32)
+        centre = np.linalg.solve(self.jacobian[i], self.centre[i] - self.start[i])
+        x, y = dx - np.float32(centre[0]), dy[:, None] - np.float32(centre[1])
+        a, b = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
+        square = a * a + b * b
+        slope_x, slope_y = inverse[0, 0] * a + inverse[1, 0] * b, inverse[0, 1] * a + inverse[1, 1] * b
+        near = (square - np.sqrt(square)) ** 2 < (slope_x**2 + slope_y**2) * np.float32(self.band[i] ** 2)
+        for place, shape in self.intruders[i]:
+            x, y = dx - np.float32(place[0]), dy[:, None] - np.float32(place[1])
+            near &= (shape[0, 0] * x + shape[0, 1] * y) ** 2 + (shape[1, 0] * x + shape[1, 1] * y) ** 2 > 1
+        rows, columns = np.divmod(np.flatnonzero(near), near.shape[1])
+        return rows, columns
 
     def _widen(self, m: int):
         """Makes room for ``m`` pixels of each ellipse."""
@@ -234,7 +221,7 @@ class Fits:
         rows, columns = self.rows[i], self.columns[i]
         n = len(rows)
         dx, dy = self.offset[i]
-        x, y = dx[columns] / np.float32(self.half[i, 0]), dy[rows, 0] / np.float32(self.half[i, 1])
+        x, y = dx[columns] / np.float32(self.half[i, 0]), dy[rows] / np.float32(self.half[i, 1])
         self.grey[i, :n] = self.image[rows + self.low[i, 1], columns + self.low[i, 0]]
         self.ideal[i, :, :n] = self.to_ideal[i, :, 1:].astype(np.float32) @ monomials(x, y)[1:]
         self.ideal[i, :, n:] = [[self.radius[i]], [0]]
@@ -384,8 +371,7 @@ def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
     influence = np.maximum(4 * np.sqrt(weight) - 3, 0)
     chance = _chance(fits, np.sqrt(share / weight), total) / noise2
     spread = (pull.sum(1, dtype=float) / (pull * influence).sum(1, dtype=float))[:, None, None] * np.eye(2)
-    xx, xy, yy = fits.inverse_shape[:, 0, 0], fits.inverse_shape[:, 0, 1], fits.inverse_shape[:, 1, 1]
-    narrowest = 2 / (xx + yy + np.hypot(xx - yy, 2 * xy))
+    narrowest = 1 / singular_values(fits.inverse_shape)[0]
     wide = (fits.blur >= np.minimum(SHARP_PX, SHARP * narrowest)) & ~fits.failed
     for i in np.flatnonzero(wide).tolist():
         n = len(fits.rows[i])
@@ -471,14 +457,11 @@ def measure_centres(
 
 def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> dict[str, np.ndarray]:
     """Fits circles of similar size side by side, as many as a processor's cache holds pixels; as :func:`_rims`."""
-    half = 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX  # of the boxes that the rims may move in
-    to_ideal = local_ideal_maps(camera, ellipses.centre_px, half)
-    masks = intruders(ellipses, neighbours, half)
     size = ellipses.radius_px()
     order = np.argsort(size, kind="stable")
     pixels = np.cumsum(2 * np.pi * size[order] * 2 * BAND_PX)
     parts = [
-        _rims(Fits(image, ellipses.select(own), half[own], to_ideal[own], [masks[i] for i in own]))
+        _rims(Fits(image, camera, ellipses.select(own), neighbours))
         for own in np.split(order, np.flatnonzero(np.diff(pixels // PIXELS_AT_ONCE)) + 1)
     ]
     return {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}

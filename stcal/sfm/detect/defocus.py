@@ -73,11 +73,20 @@ class _Law:
     def __init__(self, own: _Blurs, unit: float, curvature: tuple[float, float] | None = None):
         self.own, self.unit, self.about = own, unit, float(own.inverse_depth.mean())
         rows = np.vander((own.inverse_depth - self.about) / unit, 3, increasing=True)
-        self.coefficients, self.covariance, self.scatter = _fitted(rows, own.blur2, curvature)
         from_median = np.abs(own.blur2 - np.median(own.blur2))
-        self.plain = float(
-            robust_sigma(from_median)
-        )  # as ``scatter``, the robust σ of residuals, about a constant, px²
+        self.plain = self.scatter = float(robust_sigma(from_median))  # of residuals about a constant and the law, px²
+        weight = np.ones(len(rows))
+        for _ in range(ROUNDS):
+            scale2 = max(self.scatter, LEAST_PX2) ** 2
+            normal, right = (rows.T * weight) @ rows / scale2, (rows.T * weight) @ own.blur2 / scale2
+            if curvature is not None:
+                normal[2, 2] += 1 / curvature[1]
+                right[2] += curvature[0] / curvature[1]
+            self.covariance = np.linalg.pinv(normal, hermitian=True)
+            self.coefficients = self.covariance @ right
+            length = np.abs(own.blur2 - rows @ self.coefficients)
+            self.scatter = float(robust_sigma(length, redundancy=1 - 3 / len(rows)))
+            weight = huber_weights(length / max(self.scatter, LEAST_PX2), HUBER)
         residual = np.minimum(np.abs(own.blur2 - rows @ self.coefficients), 3 * max(self.scatter, 1e-12))
         freedom, square = len(rows) - 3, float((residual**2).sum())
         gain = float((np.minimum(from_median, 3 * max(self.plain, 1e-12)) ** 2).sum()) - square
@@ -143,26 +152,6 @@ def _laws(views: Sequence[_Blurs]) -> dict[int, _Law]:
         prior = float((weight * curvature).sum() / weight.sum()), between + 1 / float(weight.sum())
         laws = {i: _Law(circles, unit, prior) for i, circles in enough.items()}
     return laws
-
-
-def _fitted(
-    rows: np.ndarray, blur2: np.ndarray, curvature: tuple[float, float] | None
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns coefficients, their covariance, and the robust σ of the residuals."""
-    weight, scatter = np.ones(len(rows)), float(robust_sigma(np.abs(blur2 - np.median(blur2))))
-    coefficients, inverse = np.zeros(3), np.zeros((3, 3))
-    for _ in range(ROUNDS):
-        scale2 = max(scatter, LEAST_PX2) ** 2
-        normal, right = (rows.T * weight) @ rows / scale2, (rows.T * weight) @ blur2 / scale2
-        if curvature is not None:
-            normal[2, 2] += 1 / curvature[1]
-            right[2] += curvature[0] / curvature[1]
-        inverse = np.linalg.pinv(normal, hermitian=True)
-        coefficients = inverse @ right
-        length = np.abs(blur2 - rows @ coefficients)
-        scatter = float(robust_sigma(length, redundancy=1 - 3 / len(rows)))
-        weight = huber_weights(length / max(scatter, LEAST_PX2), HUBER)
-    return coefficients, inverse, scatter
 
 
 def _moved(image: ImageObservations, law: _Law, camera: Camera, focal_px: float) -> tuple[ImageObservations, float]:

@@ -38,7 +38,6 @@ from stcal.sfm.data.group_model import BOARD_LEFT_OUT, ELSEWHERE, FAR_DEG, Centr
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.arrangement import (
     FOREIGN,
-    MAX_SHIFT_PITCHES,
     Arrangement,
     Named,
     PlaneView,
@@ -117,7 +116,7 @@ def label_groups(
             # readings with covered dots must explain more circles
             found = max(found, arrange(group, step_mm, focal_px), key=Arrangement.explained)
         alone.append(as_drawn(found, target.rough_poses()))
-    arrangements = across_groups(alone, MAX_SHIFT_PITCHES * step_mm)
+    arrangements = across_groups(alone, step_mm)
     labelled = [
         ([_labelled(*image, own, found, i) for i, (image, own) in enumerate(zip(images, views, strict=True))], found)
         for images, views, found in zip(groups, likely, arrangements, strict=True)

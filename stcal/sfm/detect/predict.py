@@ -15,7 +15,7 @@ from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.group_model import Centres, ImageObservations, Note
+from stcal.sfm.data.group_model import Centres, ImageObservations, Note, rows_by
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
 from stcal.sfm.detect.candidates import (
     MAX_POSITION_ERROR,
@@ -114,10 +114,8 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     labels = [observed.labels[k] for k in rows]
     shapes_px = predicted.shape_px[np.array([place[label] for label in labels], int)]
     widest, narrowest = _stretch(shapes_px, observed.select(rows), camera)
-    planes = np.array([label.plane for label in labels], str)
     reasons: dict[Label, Note] = {}
-    for plane in dict.fromkeys(planes.tolist()):
-        members = np.flatnonzero(planes == plane)
+    for members in rows_by(label.plane for label in labels).values():
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])

@@ -107,11 +107,7 @@ def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
     cosine = direction @ diagonal / (np.linalg.norm(direction) * np.linalg.norm(diagonal))
     if abs(cosine) < ZERO_COSINE:
         return 0, 0
-    return int(np.sign(cosine)), int(np.sign(_cross(diagonal, direction)))
-
-
-def _cross(u: np.ndarray, v: np.ndarray) -> float:
-    return float(u[0] * v[1] - u[1] * v[0])
+    return int(np.sign(cosine)), int(np.sign(np.linalg.det([diagonal, direction])))
 
 
 def detect_published(
@@ -171,7 +167,7 @@ class _Rules:
             beside = self._beside(origin, self.pattern.step_radii, free)
             if len(beside) != 2:
                 continue
-            if _cross(*(self.found.xy[beside] - self.found.xy[origin])) > 0:  # the image's y points down
+            if np.linalg.det(self.found.xy[beside] - self.found.xy[origin]) > 0:  # the image's y points down
                 beside.reverse()
             circles = {self.pattern.origin: origin, self.pattern.a: beside[0], self.pattern.b: beside[1]}
             where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.centre_px[origin])

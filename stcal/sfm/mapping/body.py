@@ -128,7 +128,10 @@ def _lengths(xyz_camera: np.ndarray, corners: BodyCorners, camera: Camera) -> np
 def place_body(corners: BodyCorners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera, linked by what most images agree on."""
     views, count = _FaceViews(corners, camera), len(corners.faces)
-    edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
+    edges: dict[tuple[int, int], tuple[Rigid, int]] = {}  # in both directions
+    for (a, b), pairs in _pairs(views).items():
+        a_from_b, votes = _edge(pairs, views)
+        edges |= {(a, b): (a_from_b, votes), (b, a): (a_from_b.inverse(), votes)}
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
@@ -136,14 +139,10 @@ def place_body(corners: BodyCorners, camera: Camera) -> Body:
             "faces with at least four corners each",
         )
     seen = np.bincount(views.face, minlength=count)
-    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
-    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
+    poses = {max({a for a, _ in edges}, key=lambda face: seen[face]): Rigid()}
+    while open_edges := [(a, b) for a, b in edges if a in poses and b not in poses]:
         a, b = max(open_edges, key=lambda edge: edges[edge][1])
-        a_from_b = edges[a, b][0]
-        if a in poses:
-            poses[b] = poses[a] @ a_from_b
-        else:
-            poses[a] = poses[b] @ a_from_b.inverse()
+        poses[b] = poses[a] @ edges[a, b][0]
     placed_faces = np.isin(np.arange(count), list(poses))
     body_from_face = Poses.of(poses.get(face, Rigid()) for face in range(count))
     camera_from_body, placed_images = _images(views, corners, body_from_face, placed_faces, camera)
@@ -156,27 +155,24 @@ class _FaceViews:
     def __init__(self, corners: BodyCorners, camera: Camera):
         normalised = camera.normalised_from_pixel(corners.xy_px)
         key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
-        members = [np.flatnonzero(view_of == v) for v in range(len(key))]
         starts: list[Rigid] = []
         kept: list[int] = []
-        for v, own in enumerate(members):
-            try:
+        members: list[np.ndarray] = []  # of each start
+        for v, own in ((v, np.flatnonzero(view_of == v)) for v in range(len(key))):
+            with suppress(DegenerateError):
                 pose = camera_from_plane(fit_homography(corners.xy_face[own], normalised[own]))
-            except DegenerateError:
-                continue
-            if ((pose @ corners.xyz_face()[own])[:, 2] <= 0).any():
-                continue
-            middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
-            starts += [pose, *mirrored(Poses.of([pose]), middle)]
-            kept.append(v)
+                if ((pose @ corners.xyz_face()[own])[:, 2] > 0).all():
+                    middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
+                    starts += [pose, *mirrored(Poses.of([pose]), middle)]
+                    members += [own, own]
+                    kept.append(v)
         self.image, self.face = key[kept].T  # (v,)
         self.poses, self.cost = Poses.of([]), np.zeros((0, 2))
         if not kept:
             return
-        most = max(len(members[v]) for v in kept)
-        index = np.array([np.pad(members[v], (0, most - len(members[v]))) for v in kept])
-        real = np.array([np.arange(most) < len(members[v]) for v in kept])
-        index, real = np.repeat(index, 2, axis=0), np.repeat(real, 2, axis=0)
+        most = max(map(len, members))
+        index = np.array([np.pad(own, (0, most - len(own))) for own in members])
+        real = np.arange(most) < np.array([*map(len, members)])[:, None]
         xyz, xy = corners.xyz_face()[index], normalised[index]
         root = corners.root[index] * camera.focal * real[..., None, None]
 
@@ -408,14 +404,13 @@ def contradictions(body: Body, corners: BodyCorners) -> list[Outlier]:
     for own in (corner == k for k in range(corner.max() + 1)):
         usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
     limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
-    return [
-        Outlier(
-            used.images[used.image[k]],
-            used.faces[used.face[k]].labels()[used.corner[k]],
-            *(float(value / np.linalg.norm(used.root[k], 2)) for value in (length[k], limit[k])),
+    outliers = []
+    for k in np.flatnonzero(length > limit):
+        image, label = used.images[used.image[k]], used.faces[used.face[k]].labels()[used.corner[k]]
+        outliers.append(
+            Outlier(image, label, *(np.array([length[k], limit[k]]) / np.linalg.norm(used.root[k], 2)).tolist())
         )
-        for k in np.flatnonzero(length > limit)
-    ]
+    return outliers
 
 
 def _robust(length: np.ndarray) -> float:
@@ -557,7 +552,6 @@ def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camer
     """Maps one group by a body that its faces have placed, without the corners that contradict it."""
     model = model_of_body(body, group, camera)
     gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
-    seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
-    is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+    is_gross = np.array([seen in gross for seen in model.seen()], bool)
     missing = incremental.left_out(group, model, SHOW_MORE)
     return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)

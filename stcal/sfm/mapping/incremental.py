@@ -29,10 +29,8 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
     xyz = dict(zip(model.labels, model.xyz_model, strict=True))
     poses = dict(zip(model.images, model.camera_from_model, strict=True))
     for image in group:
-        if image.name not in poses:
-            pose = _resect(image, xyz, camera, max_error_px)
-            if pose is not None:
-                poses[image.name] = pose
+        if image.name not in poses and (pose := _resect(image, xyz, camera, max_error_px)) is not None:
+            poses[image.name] = pose
     placed = [image for image in group if image.name in poses]
     unknown = {label for image in placed for label in image.labels} - xyz.keys()
     for label, (centre, direction) in rays_of(placed, poses, unknown).items():
@@ -245,14 +243,6 @@ def labelled_model(
     if len(registered) < len(group):
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
-    is_outlier = residual > MAX_REPROJECTION_PX
-    outliers = tuple(
-        Outlier(
-            model.images[model.image_index[k]],
-            model.labels[model.point_index[k]],
-            float(residual[k]),
-            MAX_REPROJECTION_PX,
-        )
-        for k in np.flatnonzero(is_outlier)
-    )
-    return model.without(is_outlier), outliers
+    far, seen = residual > MAX_REPROJECTION_PX, model.seen()
+    outliers = tuple(Outlier(*seen[k], float(residual[k]), MAX_REPROJECTION_PX) for k in np.flatnonzero(far))
+    return model.without(far), outliers

@@ -90,14 +90,11 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
 def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
     """Returns cameras, poses, keypoints and points of a model to 12 digits, as text files lose the last ones."""
     cameras = [[i, *c.params] for i, c in sorted(reconstruction.cameras.items())]
-    images, keypoints, points = [], [], []
-    for i, image in sorted(reconstruction.images.items()):
-        pose = image.cam_from_world().matrix().ravel() if image.has_pose else np.zeros(12)
-        images.append([i, *pose])
-        keypoints += [[*each.xy, each.point3D_id if each.has_point3D() else -1] for each in image.points2D]
-    for i, point in sorted(reconstruction.points3D.items()):
-        points.append([i, *point.xyz, len(point.track.elements)])
-    parts = (np.array(each, float) for each in (cameras, images, keypoints, points))
+    images = [each for _, each in sorted(reconstruction.images.items())]
+    poses = [[i.image_id, *(i.cam_from_world().matrix().ravel() if i.has_pose else np.zeros(12))] for i in images]
+    keypoints = [[*p.xy, p.point3D_id if p.has_point3D() else -1] for image in images for p in image.points2D]
+    points = [[i, *p.xyz, len(p.track.elements)] for i, p in sorted(reconstruction.points3D.items())]
+    parts = (np.array(each, float) for each in (cameras, poses, keypoints, points))
     return [np.round(each, 12 - int(np.ceil(np.log10(max(np.abs(each).max(initial=1), 1))))) for each in parts]
 
 
@@ -277,12 +274,11 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
         residual = np.linalg.norm(model.residuals_px(camera), axis=1)
         rms = float(np.sqrt((residual**2).mean() / 2))
     if not rms <= MAX_RMS_PX:
-        k = int(np.argmax(residual))
+        image, label = model.seen()[int(np.argmax(residual))]
         raise InputError(
             "E-MODEL-MISFIT",
             f"model {path}: group {model.group}: keypoints are {rms:.3g} px RMS off the images of their points, "
-            f"{MAX_RMS_PX:g} allowed, most of all {model.labels[model.point_index[k]]} in "
-            f"{model.images[model.image_index[k]]}; adjust its bundle, or write or copy it again",
+            f"{MAX_RMS_PX:g} allowed, most of all {label} in {image}; adjust its bundle, or write or copy it again",
         )
 
 
