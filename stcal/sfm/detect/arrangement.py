@@ -219,26 +219,24 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
     """Returns the pose of an image with the most planes, then faces, then circles, and the readings that agree with it;
     None if several fit."""
-    best, best_score, rivals = None, (0, 0, 0), 0
+    found: list[tuple[tuple[int, int, int], Rigid, list[PlaneView]]] = []
     for views in readings:
         others = [v for v in readings if v is not views]
         for view in (each for each in views if each.plane in known):
             pose = view.camera_from_plane @ known[view.plane].inverse()
             agreed = [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
             faces = sum(v.plane != BOARD and v.named for v in agreed)
-            score = (len(agreed), faces, sum(len(v.rows) for v in agreed))
-            if score > best_score:
-                best, best_score, rivals = (pose, agreed), score, 0
-            elif best is not None and score == best_score:  # a rival, unless both put the plane at one place
-                span = best[1][0].span_mm()
-                rivals += np.abs(best[0].inverse() @ pose @ span - span).max() >= reach_mm
-    if best is None:
+            found.append(((len(agreed), faces, sum(len(v.rows) for v in agreed)), pose, agreed))
+    if not found:
         return None
-    agreed = best[1]
+    most, pose, agreed = max(found, key=lambda each: each[0])
+    span = agreed[0].span_mm()  # those that put its plane elsewhere are rivals
+    away = [np.abs(pose.inverse() @ other @ span - span).max() for score, other, _ in found if score == most]
+    rivals = max(away) >= reach_mm
     of_board = by_convention and agreed[0].plane == BOARD and len(readings) > 1
     if len(agreed) == 1 and (rivals or of_board or not agreed[0].named):
         return None
-    return None if rivals and not all(v.named for v in agreed) else best
+    return None if rivals and not all(v.named for v in agreed) else (pose, agreed)
 
 
 def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_mm: float, taken: set[str]):

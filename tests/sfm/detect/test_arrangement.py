@@ -20,10 +20,8 @@ TARGET = reference_target()
 
 def centres_of(centre_px, centre) -> Centres:
     """Circles at these places that are alike in all else."""
-    n = len(centre)
-    one, two = np.ones(n), np.tile(np.eye(2), (n, 1, 1))
-    domes = np.zeros((n, 3))
-    return Centres(centre_px, centre, 0.01 * two, 1e-4 * two, *[one] * 4, np.zeros((n, 2)), domes, one.astype(bool))
+    unit = np.tile(np.eye(2), (len(centre), 1, 1))
+    return Centres.without_rims(centre_px, centre, 0.01 * unit, 1e-4 * unit)
 
 
 class Seen:
@@ -215,44 +213,34 @@ def test_patterns_without_a_name_that_fit_nothing_are_left_out_with_one_note(sce
         assert note.endswith("(3 times)")
 
 
-def numbered(image, numberings) -> ImageDetection:
-    """With other numberings of its board, made of the true one and that after half a turn."""
-    seen = Seen(image)
-    (board,) = seen.boards
-    seen.boards = [BoardSighting(board.rows, np.stack(numberings(*board.numberings)))]
-    return seen.detection()
-
-
-def turned(true, other):
-    return other, true
-
-
-def is_numbered(image, result, half_a_turn=False) -> bool:
-    """Whether the board's labels are the true ones, or those after half a turn."""
-    truth, dots = places(image), places(result.observations, "board").items()
-    return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
-
-
-def test_all_images_agree_on_one_numbering(scene, group):
-    turns = (1, 0, 1, 1, 0)
-    detections = [numbered(o, turned) if turn else Seen(o).detection() for o, turn in zip(group, turns, strict=True)]
-    results, _ = labelled(scene, detections)
-    for o, r in zip(group, results, strict=True):
-        assert len(r.observations) == len(o)
-        assert is_numbered(o, r, half_a_turn=True)
+NUMBERINGS = {
+    "both": lambda true, other: (true, other),
+    "turned": lambda true, other: (other, true),
+    "certain": lambda true, other: (true,),
+    "by a column": lambda true, other: (other - [0, 1], true - [0, -1], other, true),
+}
+"""Numberings of the board in an image, of the true one and that after half a turn."""
 
 
 @pytest.mark.parametrize(
-    ("image", "others", "own"),
+    ("of_images", "half_a_turn"),
     [
-        (3, turned, lambda true, other: [true]),  # an image that is certain speaks for the group
-        (2, lambda *both: both, lambda true, other: [other - [0, 1], true - [0, -1], other, true]),  # by a column
+        (("turned", "both", "turned", "turned", "both"), True),
+        (("turned", "turned", "turned", "certain", "turned"), False),  # speaks for the group
+        (("both", "both", "by a column", "both", "both"), False),
     ],
 )
-def test_one_image_with_other_numberings_is_seen_through(scene, group, image, others, own):
-    detections = [numbered(o, own if i == image else others) for i, o in enumerate(group)]
-    results, _ = labelled(scene, detections)
-    assert all(is_numbered(o, r) for o, r in zip(group, results, strict=True))
+def test_all_images_agree_on_one_numbering(scene, group, of_images, half_a_turn):
+    seen = [Seen(o) for o in group]
+    for each, how in zip(seen, of_images, strict=True):
+        (board,) = each.boards
+        each.boards = [BoardSighting(board.rows, np.stack(NUMBERINGS[how](*board.numberings)))]
+    results, _ = labelled(scene, seen)
+    for o, r in zip(group, results, strict=True):
+        truth = places(o)
+        assert len(r.observations) == len(o)
+        for x, at in places(r.observations, "board").items():
+            assert truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at
 
 
 def test_an_image_without_a_face_keeps_no_uncertain_board(scene, group):

@@ -6,7 +6,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
@@ -14,6 +13,7 @@ from stcal.sfm.detect.candidates import Ellipses
 from stcal.sfm.detect.centres import measure_centres
 from tests.levels import sampled
 from tests.support import degrade
+from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])
 
@@ -26,26 +26,22 @@ PAD_PX = 12
 def fine_rays(camera, window, factor):
     """Subpixel columns of a window (x0, y0, x1, y1; px) and their rays, from the exact inverse distortion."""
     x0, y0, x1, y1 = window
-    x, y = np.meshgrid(
-        x0 + (np.arange((x1 - x0) * factor) + 0.5) / factor - 0.5,
-        y0 + (np.arange((y1 - y0) * factor) + 0.5) / factor - 0.5,
-    )
-    rays = camera.normalised_from_pixel(np.stack([x, y], -1))
-    return x, np.concatenate([rays, np.ones((*x.shape, 1))], -1)
+    x, y = samples(y1 - y0, x1 - x0, factor)
+    rays = camera.normalised_from_pixel(np.stack([x0 + x, y0 + y], -1))
+    return x0 + x, np.concatenate([rays, np.ones((*x.shape, 1))], -1)
 
 
-def drawn_window(camera, circles, window, blur, gradient, bright, factor):
-    """What :func:`draw` gives inside a window, before it is rounded."""
-    x, rays = fine_rays(camera, window, factor)
-    fine = np.full(x.shape, 30.0 if bright else 200.0)
-    for centre, normal, radius in circles:
-        depth = (centre @ normal) / (rays @ normal)
-        inside = np.linalg.norm(rays * depth[..., None] - centre, axis=-1) < radius
-        fine[inside] = 200.0 if bright else 30.0
-    fine *= 1 + gradient * np.sin(2 * np.pi * x / 150)
+def averaged(fine, blur, factor=8):
+    """Pixels of ``factor`` × ``factor`` samples each, after a blur, px."""
     fine = cv2.GaussianBlur(fine, (0, 0), blur * factor)
-    height, width = x.shape
-    return fine.reshape(height // factor, factor, width // factor, factor).mean((1, 3))
+    height, width = (side // factor for side in fine.shape)
+    return fine.reshape(height, factor, width, factor).mean((1, 3))
+
+
+def samples(height, width, factor=8):
+    """Columns and rows of ``factor`` × ``factor`` samples of each pixel, px."""
+    y, x = (np.mgrid[: height * factor, : width * factor] + 0.5) / factor - 0.5
+    return x, y
 
 
 def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
@@ -54,17 +50,26 @@ def draw(camera, circles, blur=0.9, gradient=0.0, bright=True, factor=8):
     Independent of the detector's edge model: a subpixel is inside or it is not. The fine grid is about the circles
     only: elsewhere the background is as smooth as its gradient.
     """
-    columns = np.arange(camera.width)
-    row = (30.0 if bright else 200.0) * (1 + gradient * np.sin(2 * np.pi * columns / 150))
-    image = np.tile(row, (camera.height, 1))
+    ground, disc = (30.0, 200.0) if bright else (200.0, 30.0)
+
+    def light(x):
+        return 1 + gradient * np.sin(2 * np.pi * x / 150)
+
+    image = np.tile(ground * light(np.arange(camera.width)), (camera.height, 1))
     for centre, _, radius in circles:
         reach = radius / (centre[2] - radius) * camera.focal.max() + PAD_PX
         (x0, y0), (x1, y1) = (camera.project(centre[None])[0] + np.array([[-reach], [reach]])).astype(int)
         x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, camera.width), min(y1, camera.height)
-        part = drawn_window(camera, circles, (x0, y0, x1, y1), blur, gradient, bright, factor)
-        rim = int(np.ceil(5 * blur))  # of the window: blurred against its mirror image
-        inner = slice(rim, -rim)
-        image[y0:y1, x0:x1][inner, inner] = part[inner, inner]
+        x, rays = fine_rays(camera, (x0, y0, x1, y1), factor)
+        inside = np.zeros(x.shape, bool)
+        for at, normal, reach in circles:
+            depth = (at @ normal) / (rays @ normal)
+            inside |= np.linalg.norm(rays * depth[..., None] - at, axis=-1) < reach
+        part = averaged(np.where(inside, disc, ground) * light(x), blur, factor)
+        inner = (
+            slice(int(np.ceil(5 * blur)), -int(np.ceil(5 * blur))),
+        ) * 2  # the rim is blurred with its mirror image
+        image[y0:y1, x0:x1][inner] = part[inner]
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
@@ -79,19 +84,9 @@ CIRCLES = [circle(-90, -60, 0, 0), circle(20, -50, 45, 30), circle(90, 40, 60, 1
 
 def start_from(camera, circles, error_px=0.15):
     """Candidates a little off, as the contour stage gives them."""
-    centres, shapes = [], []
-    for centre, normal, radius in circles:
-        angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-        e1 = np.cross(normal, [0, 1.0, 0])
-        e1 /= np.linalg.norm(e1)
-        e2 = np.cross(normal, e1)
-        rim = camera.project(centre + radius * (np.outer(np.cos(angle), e1) + np.outer(np.sin(angle), e2)))
-        (cx, cy), (d1, d2), turn = cv2.fitEllipse(rim.astype(np.float32))
-        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        axes = np.array([[c, -s], [s, c]])
-        centres.append([cx + error_px, cy - error_px])
-        shapes.append(axes @ np.diag([d1 / 2 + 0.2, d2 / 2 + 0.2]) @ axes.T)
-    return Ellipses(np.array(centres), np.array(shapes), np.full(len(circles), 100.0))
+    shapes = np.array([ellipse_of_conic(circle_conic(*own))[1] * camera.focal[0] for own in circles])
+    centres = exact(camera, circles) + np.array([error_px, -error_px])
+    return Ellipses(centres, shapes + 0.2 * np.eye(2), np.full(len(circles), 100.0))
 
 
 def exact(camera, circles):
@@ -103,11 +98,10 @@ def exact(camera, circles):
 def test_light_that_slopes_across_a_disc_does_not_move_its_centre(radius, blur):
     """0.6 % a pixel. Taken for the slope of the blurred disc, it moves the centre by its slope times the variance of
     the blur: 0.0094 and 0.025 px at blurs of 1.2 and 2 px."""
-    camera, factor, middle = Camera(80, 80, [1400.0, 1400.0], [39.5, 39.5], np.zeros(8)), 8, np.array([39.7, 40.2])
-    y, x = (np.indices((80 * factor, 80 * factor)) + 0.5) / factor - 0.5
+    camera, middle = Camera(80, 80, [1400.0, 1400.0], [39.5, 39.5], np.zeros(8)), np.array([39.7, 40.2])
+    x, y = samples(80, 80)
     inside = np.hypot(x - middle[0], y - middle[1]) < radius
-    fine = cv2.GaussianBlur(30 + inside * 150 * (1 + 0.006 * (x - middle[0])), (0, 0), blur * factor)
-    image = fine.reshape(80, factor, 80, factor).mean((1, 3))
+    image = averaged(30 + inside * 150 * (1 + 0.006 * (x - middle[0])), blur)
     start = Ellipses(middle[None] + 0.15, radius * np.eye(2)[None], np.full(1, 100.0))
     found = measure_centres(np.round(image).astype(np.uint8), camera, start, start)
     assert abs(found.centre_px[0, 0] - middle[0]) < 0.003  # the fine grid leaves 0.002
@@ -138,7 +132,7 @@ def test_without_noise_the_centre_is_the_ideal_ellipses_centre(circles, how, mos
     np.testing.assert_array_equal(of_16_bits.centre_px, found.centre_px)
 
 
-def test_a_circle_partly_hidden_is_not_measured():
+def test_a_circle_partly_hidden_is_not_measured_and_none_of_none():
     image = draw(CAMERA, CIRCLES[:2])
     start = start_from(CAMERA, CIRCLES[:2])
     x, y = start.centre_px[0].astype(int)
@@ -147,6 +141,7 @@ def test_a_circle_partly_hidden_is_not_measured():
     assert not found.ok[0]
     assert found.rim[0] < 0.8
     assert found.ok[1]
+    assert len(measure_centres(image, CAMERA, start.select([]), start.select([]))) == 0
 
 
 def test_circles_are_measured_together_as_each_alone():
@@ -162,19 +157,14 @@ def test_circles_are_measured_together_as_each_alone():
         np.testing.assert_allclose(together.covariance_px2[own], alone.covariance_px2, rtol=1e-3)
 
 
-def test_nothing_to_measure():
-    empty = Ellipses(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
-    assert len(measure_centres(np.zeros((300, 400), np.uint8), CAMERA, empty, empty)) == 0
-
-
 def half_dark(rng, radius, share, angle, noise=1.0):
     """A luminous ellipse, of one half darker by ``share``; 8 × 8 samples a pixel; and its centre."""
-    centre, size, fine = 60 + rng.uniform(-0.5, 0.5, 2), 120, 8
-    y, x = (np.mgrid[: size * fine, : size * fine] + 0.5) / fine - 0.5
+    side = 2 * radius + 64
+    centre, (x, y) = side / 2 + rng.uniform(-0.5, 0.5, 2), samples(side, side)
     u, v = (x - centre[0]) / radius, (y - centre[1]) / (0.8 * radius)
     image = np.where(u * u + v * v < 1, 170.0, 20.0)
     image[(u * u + v * v < 1) & (u * np.cos(angle) + v * np.sin(angle) > 0)] *= 1 - share
-    image = gaussian_filter(image.reshape(size, fine, size, fine).mean((1, 3)), 0.9)
+    image = averaged(image, 0.9)
     return np.clip(np.round(image + noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8), centre
 
 
@@ -204,10 +194,10 @@ def test_a_half_that_is_darker_moves_no_centre(radius, before_px):
 def sheet(radius, count=36, seed=3):
     """What circles, a cell each, cover of every pixel; their centres and shapes. Axis ratios 0.4 to 1, any place."""
     rng = np.random.default_rng([seed, radius])
-    side, columns, fine = 2 * radius + 33, 6, 8
+    side, columns = 2 * radius + 33, 6
     share = np.zeros((-(-count // columns) * side, columns * side), np.float32)
     centres, shapes = [], []
-    y, x = (np.mgrid[: side * fine, : side * fine] + 0.5) / fine - 0.5
+    x, y = samples(side, side)
     for k in range(count):
         low, centre = side * np.array([k % columns, k // columns]), side / 2 + rng.uniform(-1, 1, 2)
         turn = rng.uniform(0, np.pi)
@@ -216,9 +206,8 @@ def sheet(radius, count=36, seed=3):
         inverse = np.linalg.inv(shape)
         v = np.tensordot(inverse, np.stack([x - centre[0], y - centre[1]]), 1)
         rho = np.hypot(*v) + 1e-9
-        cover = np.clip(0.5 - fine * (rho - 1) * rho / np.hypot(*np.tensordot(inverse, v, 1)), 0, 1)
-        cover = cv2.GaussianBlur(cover, (0, 0), 0.75 * fine).reshape(side, fine, side, fine).mean((1, 3))
-        share[low[1] : low[1] + side, low[0] : low[0] + side] = cover
+        cover = np.clip(0.5 - 8 * (rho - 1) * rho / np.hypot(*np.tensordot(inverse, v, 1)), 0, 1)
+        share[low[1] : low[1] + side, low[0] : low[0] + side] = averaged(cover, 0.75)
         centres.append(low + centre)
         shapes.append(shape)
     return share, np.array(centres), np.array(shapes)
@@ -245,12 +234,10 @@ def error_over_sigma(radius, bright, before, noise, after, repeats, together=9):
         start = Ellipses(centre + 0.1, shape + 0.2 * np.eye(2), np.full(len(centre), 100.0))
         clean = before(40 + 120 * (share if bright else 1 - share))
         image = degrade.stored(after(degrade.noisy(clean, noise, seed)))
-        for k in range(0, len(centre), together):
-            own = start.select(np.arange(k, k + together))
-            found = measure_centres(image, camera, own, own)
-            assert found.ok.all()
-            error = found.centre_px - centre[k : k + together]
-            normalised.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2), error) / 2)
+        found = measure_centres(image, camera, start, start, np.arange(len(centre)) // together)
+        assert found.ok.all()
+        error = found.centre_px - centre
+        normalised.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px2), error) / 2)
     return np.sqrt(np.mean(normalised))
 
 

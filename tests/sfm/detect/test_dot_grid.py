@@ -29,9 +29,7 @@ def test_another_pitch_than_stated_is_named_with_the_true_ratio(dots, factor):
 
 def test_a_grid_of_other_dots_is_not_the_board(dots):
     board = replace(reference_board(), rows=12, columns=14, pitch_mm=60.0, corner=None)
-    assert contradiction(dots[0], board, dots[1], []) == ""
-    assert contradiction(dots[0], replace(reference_board(), corner=None), dots[1], []) == ""
     tiny = replace(board, pitch_mm=0.5, radius_mm=0.1, unusual_size=True)  # as its file says
-    assert contradiction(dots[0], tiny, dots[1], []) == ""
     small = replace(board, pitch_mm=1.0, radius_mm=0.06)  # smaller radii are tried than a file may state
-    assert contradiction(dots[0], small, dots[1], []) == ""
+    for other in (board, replace(reference_board(), corner=None), tiny, small):
+        assert contradiction(dots[0], other, dots[1], []) == ""

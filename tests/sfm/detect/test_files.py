@@ -26,19 +26,9 @@ def detected(sample, tmp_path):
     shutil.copy(sample / "images" / IMAGE, folder / IMAGE)
     camera = read_camera(sample / "cameras.txt")
 
-    def detect(options: EllipseOptions | None = None):
-        done = []
-        found = detect_files(
-            find_images(folder)[0],
-            camera,
-            reference_target(),
-            reference_board(),
-            options or EllipseOptions(),
-            tmp_path / "cache",
-            1,
-            done.append,
-        )
-        return found, done
+    def detect():
+        done, how = [], (reference_target(), reference_board(), EllipseOptions(), tmp_path / "cache", 1)
+        return detect_files(find_images(folder)[0], camera, *how, done.append), done
 
     return detect, folder, tmp_path / "cache"
 

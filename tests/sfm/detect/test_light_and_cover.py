@@ -18,19 +18,18 @@ from tests.support import degrade
 FIRST = "12/IMG_1000"
 
 
-def read(bench, pixels):
-    return read_image(
-        degrade.stored(pixels), bench.data.camera, reference_target(), reference_board(), EllipseOptions()
-    )
+def assert_all_read(bench, pixels) -> None:
+    designs = reference_target(), reference_board()
+    reading = read_image(degrade.stored(pixels), bench.data.camera, *designs, EllipseOptions())
+    assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
+    assert [len(board.rows) for board in reading.boards] == [63]
 
 
 def test_an_image_alone_reads_a_face_five_times_as_dark_as_the_rest(bench):
     """No other image helps: circles of 35 grey values beside the other face's and the board's of 180."""
     photo = bench.groups("12").photographs[0]
     (dark,) = [plane for plane in photo.faces if plane.name == "1"]
-    reading = read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
-    assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
-    assert [len(board.rows) for board in reading.boards] == [63]
+    assert_all_read(bench, degrade.brightened(photo.grey, photo.face_region(dark), 0.2))
 
 
 @pytest.mark.parametrize("factor", [3.0, 1 / 3])
@@ -43,9 +42,7 @@ def test_an_image_alone_reads_a_board_in_other_light_than_the_target(bench, fact
     target = photo.face_region(photo.faces[0]) > 0.99
     darker = float(np.percentile(pixels[target], 99) / np.percentile(photo.grey[target], 99))
     assert after / before / darker == pytest.approx(factor, rel=0.02)  # light, not exposure
-    reading = read(bench, pixels)
-    assert {each.face: len(each.rows) for each in reading.faces} == {"1": 10, "2": 10}
-    assert [len(board.rows) for board in reading.boards] == [63]
+    assert_all_read(bench, pixels)
 
 
 @pytest.mark.parametrize("group", sampled(["12", "14", "15", "23"]))

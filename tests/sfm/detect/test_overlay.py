@@ -16,15 +16,8 @@ def overlay(labels, centres, shapes, scale: float, width: int = 1600, notes: int
     n = len(labels)
     size = (round(width * 0.75 * scale), round(width * scale))
     _, jpeg = cv2.imencode(".jpg", np.full((*size, 3), GREY, np.uint8))
-    image = ImageObservations(
-        "12/a.jpg",
-        "12",
-        tuple(labels),
-        centres,
-        np.zeros((n, 2)),
-        np.array(shapes) / FOCAL[:, None],
-        np.tile(np.eye(2), (n, 1, 1)),
-    )
+    seen = centres, np.zeros((n, 2)), np.array(shapes) / FOCAL[:, None], np.tile(np.eye(2), (n, 1, 1))
+    image = ImageObservations("12/a.jpg", "12", tuple(labels), *seen)
     drawn = draw_overlay(jpeg.tobytes(), scale, image, ["1", "2"], FOCAL, notes, left_out)
     return cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR).astype(float)
 

@@ -50,11 +50,21 @@ def test_a_database_that_finds_no_space_is_one_error_and_nothing_is_left(scene, 
     assert len(ends) > 3
 
 
-def test_the_pixel_origin_moves_by_half_a_pixel_and_back(scene, database, observed):
+def test_a_database_holds_one_camera_a_frame_for_each_image_and_the_keypoints_half_a_pixel_on(
+    scene, database, observed
+):
     """COLMAP puts the centre of the first pixel at (0.5, 0.5); float32 leaves half a step of 2.4e-4 px near 2592. It
-    projects where our camera does."""
+    projects where our camera does. Pairs are calibrated: it passes over others."""
+    assert sorted(p.name for p in database.parent.iterdir()) == ["database.db"]
     with pycolmap.Database.open(str(database)) as opened:
         camera = opened.read_camera(1)
+        assert (opened.num_cameras(), opened.num_rigs()) == (1, 1)
+        assert opened.num_images() == opened.num_frames() == len(observed)
+        pairs, geometries = opened.read_two_view_geometries()
+        assert len(pairs) == opened.num_matched_image_pairs() > 0
+        assert {g.config for g in geometries} == {pycolmap.TwoViewGeometryConfiguration.CALIBRATED}
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        assert images == {i: name for name, i in image_ids(observed).items()}
         for image in observed:
             stored = opened.read_keypoints(image_ids(observed)[image.name])[:, :2].astype(float)
             back = from_colmap_px(stored)
@@ -65,18 +75,6 @@ def test_the_pixel_origin_moves_by_half_a_pixel_and_back(scene, database, observ
     xyz = np.array([[0.1, -0.2, 1.0], [-0.3, 0.2, 1.1]])
     theirs = np.array([camera.img_from_cam(point) for point in xyz])
     assert np.abs(theirs - 0.5 - scene.camera.project(xyz)).max() < 1e-9
-
-
-def test_one_camera_one_rig_a_frame_for_each_image_and_calibrated_pairs(database, observed):
-    assert sorted(p.name for p in database.parent.iterdir()) == ["database.db"]
-    with pycolmap.Database.open(str(database)) as opened:
-        assert (opened.num_cameras(), opened.num_rigs()) == (1, 1)
-        assert opened.num_images() == opened.num_frames() == len(observed)
-        pairs, geometries = opened.read_two_view_geometries()
-        assert len(pairs) == opened.num_matched_image_pairs() > 0
-        assert {g.config for g in geometries} == {pycolmap.TwoViewGeometryConfiguration.CALIBRATED}
-        images = {image.image_id: image.name for image in opened.read_all_images()}
-    assert images == {i: name for name, i in image_ids(observed).items()}
 
 
 def test_board_dots_match_in_a_group_only_and_target_circles_everywhere(observed):
@@ -90,9 +88,9 @@ def test_board_dots_match_in_a_group_only_and_target_circles_everywhere(observed
     assert all(a.labels[i] == other.labels[j] for i, j in across)
 
 
-def map_one(scene, observed, database, tmp_path, group, pairs=None):
+def map_one(scene, observed, database, tmp_path, group):
     own = [o for o in observed if o.group == group]
-    pairs = pairs or rank_pairs(own, scene.camera, PairOptions())
+    pairs = rank_pairs(own, scene.camera, PairOptions())
     ids = image_ids(observed)
     return own, map_group(database, tmp_path / "scratch", own, list(ids), ids, pairs, scene.camera)
 
