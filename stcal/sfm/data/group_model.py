@@ -277,14 +277,9 @@ class GroupModel(Measured):
         arrays = {name: getattr(self, name)[keep] for name in _PER_OBSERVATION}
         arrays["point_index"] = np.searchsorted(kept_points, arrays["point_index"])
         arrays["image_index"] = np.searchsorted(kept_images, arrays["image_index"])
-        return replace(
-            self,
-            images=tuple(self.images[i] for i in kept_images),
-            camera_from_model=tuple(self.camera_from_model[i] for i in kept_images),
-            labels=tuple(self.labels[i] for i in kept_points),
-            xyz_model=self.xyz_model[kept_points],
-            **arrays,
-        )
+        images, poses = (tuple(each[i] for i in kept_images) for each in (self.images, self.camera_from_model))
+        labels, points = tuple(self.labels[i] for i in kept_points), self.xyz_model[kept_points]
+        return replace(self, images=images, camera_from_model=poses, labels=labels, xyz_model=points, **arrays)
 
 
 M = TypeVar("M", bound=GroupModel)
@@ -331,19 +326,11 @@ def assemble(
     rows = [(i, index[label], k) for i, label, k in every if label in index]
     image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
     row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
-    return kind(
-        group=group,
-        images=tuple(image.name for image in images),
-        camera_from_model=tuple(poses),
-        labels=tuple(labels),
-        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
-        image_index=image_index,
-        point_index=point_index,
-        keypoint=keypoint,
-        measured_px=np.concatenate([image.centre_px for image in images])[row],
-        shift_px=np.zeros((len(rows), 2)),
-        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
-    )
+    names, points = tuple(image.name for image in images), np.array([xyz[label] for label in labels]).reshape(-1, 3)
+    measured_px = np.concatenate([image.centre_px for image in images])[row]
+    covariance_px2 = np.concatenate([image.covariance_px2 for image in images])[row]
+    observed = image_index, point_index, keypoint, measured_px, np.zeros((len(rows), 2)), covariance_px2
+    return kind(group, names, tuple(poses), tuple(labels), points, *observed)
 
 
 NOT_AS_DRAWN = "not-as-drawn"  # faces are not where the design, or the names of groups, have them

@@ -112,11 +112,9 @@ class Arrangement:
 
     def moved(self, cameras: Poses, planes: Poses) -> "Arrangement":
         """Returns the arrangement with other poses, in the order of its own."""
-        return replace(
-            self,
-            camera_from_group=dict(zip(self.camera_from_group, cameras, strict=True)),
-            group_from_plane=dict(zip(self.group_from_plane, planes, strict=True)),
-        )
+        by_image = dict(zip(self.camera_from_group, cameras, strict=True))
+        by_plane = dict(zip(self.group_from_plane, planes, strict=True))
+        return replace(self, camera_from_group=by_image, group_from_plane=by_plane)
 
     def explained(self) -> int:
         """Returns the score: the number of circles of the readings that fit."""

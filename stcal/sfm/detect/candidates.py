@@ -39,12 +39,8 @@ MAX_AREA_ERROR = 0.15
 """Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
 MIN_THRESHOLD = 4.0  # smallest threshold, in grey values of the 8-bit image
 
-OPTION_RANGES = {
-    "min_diameter_px": (1.0, 1e6),
-    "max_diameter_px": (1.0, 1e6),
-    "min_axis_ratio": (0.01, 1.0),
-    "min_contrast": (1e-6, 1.0),
-}
+OPTION_RANGES = dict.fromkeys(("min_diameter_px", "max_diameter_px"), (1.0, 1e6))
+OPTION_RANGES |= {"min_axis_ratio": (0.01, 1.0), "min_contrast": (1e-6, 1.0)}
 
 
 @dataclass(frozen=True, slots=True)

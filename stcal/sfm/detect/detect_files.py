@@ -345,11 +345,9 @@ def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None
         handed = board is not None and board.corner is not None and board.rows != board.columns
         if handed and sum(bool(image.detection.boards) for image in mirrored) > len(mirrored) / 2:
             remedy = f"as the board's dots are the right way round, {drawing}"
-        raise DetectionError(
-            "E-FACES-MIRRORED",
-            f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
-            f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; {remedy}",
-        )
+        count = f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
+        shown = f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored"
+        raise DetectionError("E-FACES-MIRRORED", f"{count}{shown}; {remedy}")
 
 
 def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:

@@ -77,10 +77,8 @@ def contradiction(
             measured = 1 / float(np.median(radii))
             most = len(grid.rows) >= MOST_OF_IT * len(board.cells())
             if most and max(measured / stated, stated / measured) > 1 + STEP_TOLERANCE:
-                return (
-                    f"a grid of the board's dots is there, its pitch {measured:.2f} times their radius, in the board "
-                    f"file {stated:.2f} times: correct pitch_mm or radius_mm"
-                )
+                there = f"a grid of the board's dots is there, its pitch {measured:.2f} times their radius"
+                return f"{there}, in the board file {stated:.2f} times: correct pitch_mm or radius_mm"
     return ""
 
 

@@ -138,14 +138,10 @@ def detect_image(
             board_sightings.append(BoardSighting(rows, corners.numberings(view.ids)))
         else:
             sightings.append(FaceSighting(face, rows, view.ids))
-    return replace(
-        detection,
-        centres=Centres.concatenate(parts),
-        boards=tuple(board_sightings),
-        printed=tuple(sightings),
-        notes=(*detection.notes, *notes),
-        candidates=detection.candidates + sum(len(sighting.rows) for sighting in board_sightings),
-    )
+    candidates = detection.candidates + sum(len(sighting.rows) for sighting in board_sightings)
+    detection = replace(detection, centres=Centres.concatenate(parts), candidates=candidates)
+    found = {"boards": tuple(board_sightings), "printed": tuple(sightings)}
+    return replace(detection, notes=(*detection.notes, *notes), **found)
 
 
 def _detect_circles(
@@ -194,15 +190,11 @@ def _detect_circles(
         parts.append(centres.select(centres.ok))
         sightings.append(tuple(each.by(row) for each in own))
     first, second = len(reading.faces), len(reading.faces) + len(reading.unnamed)
-    return ImageDetection(
-        Centres.concatenate(parts),
-        tuple(face for (face,) in sightings[:first]),
-        tuple(grid for (grid,) in sightings[second:]),
-        reading.mirrored,
-        tuple(notes),
-        sum(len(e) for e in reading.found.values()),
-        tuple(sightings[first:second]),
-    )
+    named, unnamed, grids = sightings[:first], sightings[first:second], sightings[second:]
+    faces, boards = (tuple(each for (each,) in alone) for alone in (named, grids))
+    outlines = sum(map(len, reading.found.values()))
+    seen = faces, boards, reading.mirrored, tuple(notes), outlines, tuple(unnamed)
+    return ImageDetection(Centres.concatenate(parts), *seen)
 
 
 def image_corners(camera: Camera) -> np.ndarray:

@@ -178,10 +178,8 @@ def _left_out(views: Readings, why: str = "") -> str:
 
 
 def _open_face_note(circles: int, faces: Collection[str]) -> str:
-    return (
-        f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another; left out, "
-        "show the circles that tell the faces apart"
-    )
+    fits = f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another"
+    return f"{fits}; left out, show the circles that tell the faces apart"
 
 
 STEEP_RAD = np.radians(85)  # largest tilt of circles of the first look that are compared with their places

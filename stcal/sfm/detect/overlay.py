@@ -70,9 +70,12 @@ def draw_overlay(
     size = max(0.4, picture.shape[1] / 2800)
     colours = {face: PALETTE[i % len(PALETTE)] for i, face in enumerate(faces)} | {BOARD: BOARD_COLOUR}
     numbered = _numbered_dots(observations, MIN_LABEL_GAP * size / scale)
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])  # lens distortion within an ellipse is not visible
     for label, centre, shape in zip(observations.labels, observations.centre_px, observations.shape, strict=True):
         key = label.plane
-        rim = _rim(centre, shape * focal_px[:, None], scale)
+        rim = centre + circle @ (shape * focal_px[:, None]).T
+        rim = np.round(((rim + 0.5) * scale - 0.5) * 16).astype(np.int32)  # 1/16 px
         cv2.polylines(picture, [rim], True, colours[key], 1, cv2.LINE_AA, shift=4)
         at = ((centre + 0.5) * scale - 0.5).round().astype(int)
         cv2.drawMarker(picture, at.tolist(), colours[key], cv2.MARKER_CROSS, 5, 1, cv2.LINE_AA)
@@ -105,13 +108,6 @@ def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLab
         steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1) if len(line) > 1 else np.zeros(1)
         chosen |= set(line if np.median(steps) > gap_px else (*line[:1], *line[-1:]))
     return chosen
-
-
-def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarray:
-    """Returns points of the rim in the thumbnail, in 1/16 px. Lens distortion within a circle is not visible."""
-    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    rim = centre_px + np.column_stack([np.cos(angle), np.sin(angle)]) @ shape_px.T
-    return np.round(((rim + 0.5) * scale - 0.5) * 16).astype(np.int32)
 
 
 def _name_faces(picture, observations: ImageObservations, scale: float, colours: dict, size: float) -> None:

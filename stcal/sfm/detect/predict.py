@@ -347,7 +347,10 @@ def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
         box = (float(middle[0]), float(middle[1])), (2 * float(half[0]), 2 * float(half[1])), turn
         cv2.ellipse(discs, box, 1.0 if polarity == "bright" else -1.0, -1)
     reach = round(margin / scale)
-    part = _part(grey, low - reach, low + np.round(size / scale).astype(int) + reach)
+    (left, top), (right, bottom) = (low - reach).tolist(), (low + np.round(size / scale).astype(int) + reach).tolist()
+    part = grey[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]  # the edge is replicated outside of it
+    beyond = max(-top, 0), max(bottom - len(grey), 0), max(-left, 0), max(right - grey.shape[1], 0)
+    part = cv2.copyMakeBorder(part, *beyond, cv2.BORDER_REPLICATE)
     small = cv2.resize(part, tuple((size + 2 * margin).tolist()), interpolation=cv2.INTER_AREA).astype(np.float32)
     small, discs = (each - cv2.blur(each, (LEVEL_PX, LEVEL_PX)) for each in (small, discs))
     correlation = cv2.matchTemplate(small, discs, cv2.TM_CCOEFF_NORMED)
@@ -355,11 +358,3 @@ def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
     if not correlation[row, column] >= CORRELATED:
         return np.zeros(2)
     return (np.array([column, row]) - margin) / scale
-
-
-def _part(grey: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Returns a part of an image, with the edge replicated outside of the image."""
-    (left, top), (right, bottom), (height, width) = low.tolist(), high.tolist(), grey.shape
-    inside = grey[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
-    borders = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
-    return cv2.copyMakeBorder(inside, *borders, cv2.BORDER_REPLICATE) if any(borders) else inside

@@ -52,13 +52,13 @@ class PublishedPattern:
         try:
             self._read(target)
         except (LookupError, ValueError) as error:
-            raise InputError(
-                "E-TARGET-NOT-PUBLISHED",
-                f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error}); --solve paper needs "
+            fault = f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error})"
+            form = (
                 "faces with large circles along X, Y and the diagonal, a small circle beside the origin on each axis, "
-                "and a small circle beside the last one of the diagonal, whose direction identifies the face; use "
-                "joint or chain",
-            ) from error
+            )
+            form += "and a small circle beside the last one of the diagonal, whose direction identifies the face"
+            remedy = f"--solve paper needs {form}; use joint or chain"
+            raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}; {remedy}") from error
 
     def _read(self, target: TargetDesign) -> None:
         first, places = target.faces[0], [dict(zip(face.ids, face.xy_mm, strict=True)) for face in target.faces]

@@ -133,11 +133,9 @@ def place_body(corners: BodyCorners, camera: Camera) -> Body:
         a_from_b, votes = _edge(pairs, views)
         edges |= {(a, b): (a_from_b, votes), (b, a): (a_from_b.inverse(), votes)}
     if not edges:
-        raise MappingError(
-            "E-BODY-UNLINKED",
-            f"target: {count} faces of known shape, but no image shows two of them; add images that show neighbouring "
-            "faces with at least four corners each",
-        )
+        fault = f"target: {count} faces of known shape, but no image shows two of them"
+        remedy = "add images that show neighbouring faces with at least four corners each"
+        raise MappingError("E-BODY-UNLINKED", f"{fault}; {remedy}")
     seen = np.bincount(views.face, minlength=count)
     poses = {max({a for a, _ in edges}, key=lambda face: seen[face]): Rigid()}
     while open_edges := [(a, b) for a, b in edges if a in poses and b not in poses]:
@@ -433,11 +431,8 @@ class PlacedBody:
 
     def unlinked_notes(self) -> list[str]:
         """Returns a note for each face of known shape that no image shows together with one that is placed."""
-        return [
-            f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} "
-            "corners each; add one that does"
-            for face in self.unlinked
-        ]
+        why = f"left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} corners each"
+        return [f"face {face}: {why}; add one that does" for face in self.unlinked]
 
 
 def plain_lens(camera: Camera) -> Camera:
@@ -480,11 +475,9 @@ def place_and_find_camera(
     bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
     best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
     if best is None:
-        raise MappingError(
-            "E-BODY-NO-CAMERA",
-            f"camera: no focal length of {cameras[-1].focal[0]:.0f} px and less explains the views of the faces; check "
-            "the sizes in target.toml, or give a camera file with --camera",
-        )
+        fault = f"camera: no focal length of {cameras[-1].focal[0]:.0f} px and less explains the views of the faces"
+        remedy = "check the sizes in target.toml, or give a camera file with --camera"
+        raise MappingError("E-BODY-NO-CAMERA", f"{fault}; {remedy}")
     lens = unknown_lens(best.camera)
     assert lens.covariance is not None
     basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
@@ -500,18 +493,15 @@ def _require_sizes(corners: BodyCorners, camera: Camera) -> None:
         return
     names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
     if alike < len(names):
-        told = (
-            f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
-            f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states; measure the "
-            "side of each print"
-        )
+        told = f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+        told += f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states"
+        remedy = "measure the side of each print, and correct it"
     else:
         each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
-        told = (
-            f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other faces "
-            "agree with one another; measure the side of its print"
-        )
-    raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
+        told = f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other "
+        told += "faces agree with one another"
+        remedy = "measure the side of its print, and correct it"
+    raise MappingError("E-BODY-SIZES", f"target: {told}; {remedy}")
 
 
 def _with_focal_length(corners: BodyCorners, camera: Camera) -> Body | None:
@@ -531,11 +521,9 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
     """Returns the model of a group: placed images, points that two of them see, and what these determine further."""
     placed = [image for image in group if image.name in body.camera_from_body]
     if len(placed) < 2:
-        raise MappingError(
-            "E-BODY-FEW-IMAGES",
-            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, 2 "
-            "needed; add images that each show two faces",
-        )
+        shown = f"{len(placed)} of {len(group)} images show faces of known shape well enough, 2 needed"
+        remedy = "add images that each show two faces"
+        raise MappingError("E-BODY-FEW-IMAGES", f"group {group[0].group}: {shown}; {remedy}")
     designed: dict[Label, np.ndarray] = {
         label: xyz
         for face in body.faces

@@ -41,14 +41,9 @@ LOG_FATAL_ALONE = 3
 
 def colmap_camera(camera: Camera) -> pycolmap.Camera:
     """Returns the camera in COLMAP's form, with COLMAP's pixel origin."""
-    return pycolmap.Camera(
-        camera_id=CAMERA_ID,
-        model=camera.colmap_model,
-        width=camera.width,
-        height=camera.height,
-        params=camera.colmap_params(),
-        has_prior_focal_length=True,
-    )
+    size, lens = {"width": camera.width, "height": camera.height}, camera.colmap_params()
+    of = {"camera_id": CAMERA_ID, "model": camera.colmap_model, "params": lens}
+    return pycolmap.Camera(**of, **size, has_prior_focal_length=True)
 
 
 def to_colmap_px(xy_px: np.ndarray) -> np.ndarray:
@@ -126,9 +121,8 @@ def write_database(
 def unwritable(path: str | Path, error: RuntimeError) -> InputError:
     """Returns the error of a database that COLMAP cannot write, or cannot open for lack of space beside it."""
     reason = re.sub(r"^\[[^]]*] *", "", str(error))
-    return InputError(
-        "E-OUTPUT-UNWRITABLE", f"database {path}: cannot be written ({reason}); check the folder's space and rights"
-    )
+    fault = f"database {path}: cannot be written ({reason})"
+    return InputError("E-OUTPUT-UNWRITABLE", f"{fault}; check the folder's space and rights")
 
 
 def remove_database(path: Path) -> None:

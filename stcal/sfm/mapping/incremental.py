@@ -126,21 +126,17 @@ def map_group(
             raise
         raise unwritable(database, error) from error
     if reconstruction is None:
-        raise MappingError(
-            "E-MAPPING-NO-MODEL",
-            f"group {group[0].group}: no model from the pair {pair.first}, {pair.second} "
-            f"({pair.shared} circles in common); add views between the two, or change --max-angle",
-        )
+        of = f"no model from the pair {pair.first}, {pair.second} ({pair.shared} circles in common)"
+        remedy = "add views between the two, or change --max-angle"
+        raise MappingError("E-MAPPING-NO-MODEL", f"group {group[0].group}: {of}; {remedy}")
     model, outliers = labelled_model(reconstruction, group, ids, camera)
     count = Counter(label for image in group for label in image.labels)
     wanted = sum(n >= 2 for n in count.values())
     if len(model.labels) < MIN_AGREEMENT * wanted:
-        raise MappingError(
-            "E-MAPPING-DISAGREE",
-            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
-            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved",
-        )
+        agree = f"{len(model.labels)} of {wanted} circles agree between the images to {MAX_REPROJECTION_PX:g} px"
+        fault = f"group {model.group}: {agree}, {MIN_AGREEMENT * wanted:.0f} needed"
+        remedy = "check that the camera file belongs to the images, and that nothing but the camera moved"
+        raise MappingError("E-MAPPING-DISAGREE", f"{fault}; {remedy}")
     return Mapping(model, outliers, left_out(group, model), seeded, SHOW_BOTH)
 
 
@@ -150,12 +146,11 @@ def left_out(group: Sequence[ImageObservations], model: WorldModel, remedy: str 
     for image in group:
         if image.name not in model.images:
             known = len(set(image.labels) & set(model.labels))
-            reasons[image.name] = (
-                f"{known} of its circles or corners are in the model, {MIN_POINTS} needed; {remedy}"
-                if known < MIN_POINTS
-                else f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px; "
-                "check that it is sharp, and that nothing but the camera moved"
-            )
+            why = f"{known} of its circles or corners are in the model, {MIN_POINTS} needed; {remedy}"
+            if known >= MIN_POINTS:
+                fit = f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px"
+                why = f"{fit}; check that it is sharp, and that nothing but the camera moved"
+            reasons[image.name] = why
     return reasons
 
 

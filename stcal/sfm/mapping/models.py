@@ -34,6 +34,10 @@ MAX_LENGTH_ERROR = 1e-3
 """Largest deviation of a quaternion's length from 1. Text files may hold few digits; quaternions are normalised."""
 
 
+def _fault(code: str, path: Path, fault: str, remedy: str = "write or copy it again") -> InputError:
+    return InputError(code, f"model {path}: {fault}; {remedy}")
+
+
 def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
     """Returns COLMAP's transform as a :class:`Rigid`."""
     return Rigid(pose.rotation.matrix(), pose.translation)
@@ -80,11 +84,8 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
     except (InputError, RuntimeError, OSError):
         same = False
     if not same:
-        raise InputError(
-            "E-OUTPUT-READ-BACK",
-            f"model {folder}: its files differ from what was written; check the folder's space and rights, "
-            "or give another place",
-        )
+        remedy = "check the folder's space and rights, or give another place"
+        raise _fault("E-OUTPUT-READ-BACK", folder, "its files differ from what was written", remedy)
 
 
 def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
@@ -120,11 +121,8 @@ def find_models(folder: str | Path) -> list[Path]:
     places = sorted([folder, *folder.glob("*"), *folder.glob("*/*")]) if folder.is_dir() else []
     models = [p for p in places if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
     if not models:
-        raise InputError(
-            "E-MODEL-UNREADABLE",
-            f"model {folder}: no COLMAP model (cameras, images and points3D as .bin or .txt) there; "
-            "give the folder that the mapper or the GUI wrote",
-        )
+        missing = "no COLMAP model (cameras, images and points3D as .bin or .txt) there"
+        raise _fault("E-MODEL-UNREADABLE", folder, missing, "give the folder that the mapper or the GUI wrote")
     return models
 
 
@@ -139,9 +137,7 @@ def read_model(
     reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
     if len(cameras) != 1:
-        raise InputError(
-            "E-MODEL-CAMERAS", f"model {path}: {len(cameras)} cameras, 1 needed; map the exported database as it is"
-        )
+        raise _fault("E-MODEL-CAMERAS", path, f"{len(cameras)} cameras, 1 needed", "map the exported database as it is")
     native = cameras[0]
     camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
     of_run = {image.name: (image, xy) for image, xy in zip(observations, corrected_px, strict=True)}
@@ -167,7 +163,7 @@ def read_model(
             _require_fit(path, model, camera.sized(0, 0))
             groups.append(model)
     if not groups:
-        raise InputError("E-MODEL-EMPTY", f"model {path}: no image with a pose and labelled points; map again")
+        raise _fault("E-MODEL-EMPTY", path, "no image with a pose and labelled points", "map again")
     named_points = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
     absent = len(named_points - set(reconstruction.points3D))
     unlabelled = len(reconstruction.points3D) - len(labelled)
@@ -187,17 +183,13 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
         text = read_bytes(texts, TABLE_BYTES).decode("utf-8-sig", "replace") if texts.exists() else ""
         for image in image_lines(text, f"model {texts}"):
             if not image.followed:  # COLMAP passes over images without points that lack their empty line
-                raise InputError(
-                    "E-MODEL-UNREADABLE",
-                    f"model {texts}: line {image.number}: {image.name[:80]} has no second line, which is empty without "
-                    "points; add it after each such image, or export the model anew",
-                )
+                fault = f"line {image.number}: {image.name[:80]} has no second line, which is empty without points"
+                remedy = "add it after each such image, or export the model anew"
+                raise _fault("E-MODEL-UNREADABLE", texts, fault, remedy)
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
         reason = _CHECK.sub("", " ".join(str(error).split()))[-150:] or "a line or record of another form"
-        raise InputError(
-            "E-MODEL-UNREADABLE", f"model {path}: damaged or incomplete ({reason}); write or copy it again"
-        ) from error
+        raise _fault("E-MODEL-UNREADABLE", path, f"damaged or incomplete ({reason})") from error
 
 
 _CHECK = re.compile(r"\[\w.]+:\d+\] Check failed: .*")
@@ -245,8 +237,7 @@ def _require_whole(file: Path) -> None:
 
 
 def _of_another_run(path: Path, fault: str) -> InputError:
-    remedy = "give the run that the model's database came from"
-    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; {remedy}")
+    return _fault("E-MODEL-NOT-OF-RUN", path, fault, "give the run that the model's database came from")
 
 
 def require_keypoints(
@@ -275,11 +266,9 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
         rms = float(np.sqrt((residual**2).mean() / 2))
     if not rms <= MAX_RMS_PX:
         image, label = model.seen()[int(np.argmax(residual))]
-        raise InputError(
-            "E-MODEL-MISFIT",
-            f"model {path}: group {model.group}: keypoints are {rms:.3g} px RMS off the images of their points, "
-            f"{MAX_RMS_PX:g} allowed, most of all {label} in {image}; adjust its bundle, or write or copy it again",
-        )
+        off = f"keypoints are {rms:.3g} px RMS off the images of their points, {MAX_RMS_PX:g} allowed"
+        fault, remedy = f"{off}, most of all {label} in {image}", "adjust its bundle, or write or copy it again"
+        raise _fault("E-MODEL-MISFIT", path, f"group {model.group}: {fault}", remedy)
 
 
 def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
@@ -287,11 +276,8 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
     pose = image.cam_from_world()
     length = math.hypot(*pose.rotation.quat)  # accepts any numbers without a warning
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
-        raise InputError(
-            "E-MODEL-POSE",
-            f"model {path}: image {image.name}: no pose (quaternion of length {length:.4g}, 1 needed; translation "
-            f"{pose.translation.tolist()}); write or copy it again",
-        )
+        found = f"quaternion of length {length:.4g}, 1 needed; translation {pose.translation.tolist()}"
+        raise _fault("E-MODEL-POSE", path, f"image {image.name}: no pose ({found})")
     pose.rotation.normalize()
     return rigid_from_colmap(pose)
 
@@ -331,8 +317,7 @@ def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tu
     xyz = {label: reconstruction.point3D(point).xyz for label, point in chosen.items()}
     for label in sorted(xyz):
         if not np.isfinite(xyz[label]).all():
-            fault = f"model {path}: point {chosen[label]} ({label}) is not finite"
-            raise InputError("E-MODEL-POSE", f"{fault}; write or copy it again")
+            raise _fault("E-MODEL-POSE", path, f"point {chosen[label]} ({label}) is not finite")
     model = assemble(WorldModel, group, observations, [pose_of_image(path, image) for image in native], xyz)
     names = [[point.point3D_id for point in image.points2D] for image in native]
     at = zip(model.image_index.tolist(), model.point_index.tolist(), model.keypoint.tolist(), strict=True)

@@ -41,10 +41,8 @@ class PairOptions:
     def __post_init__(self):
         require_fields(self, "options")
         if self.max_angle_rad is not None and not 0 < self.max_angle_rad <= np.pi:
-            raise InputError(
-                "E-OPTION-RANGE",
-                f"option max_angle_rad {self.max_angle_rad:g}: more than 0, up to π needed; give another",
-            )
+            needed = f"option max_angle_rad {self.max_angle_rad:g}: more than 0, up to π needed; give another"
+            raise InputError("E-OPTION-RANGE", needed)
 
     def limit_rad(self) -> float:
         """Returns the limit that is used."""

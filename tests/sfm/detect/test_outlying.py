@@ -119,17 +119,11 @@ def test_an_image_without_points_keeps_its_pose():
     grid = np.array([[x, y, 0.0] for x in range(-40, 60, 20) for y in range(-40, 60, 20)])
     poses = [Rigid.exp([0.1 * i, 0.3 - 0.2 * i, 0.05, 5 * i, -8, 500]) for i in range(3)]
     planes = [Rigid(), Rigid.exp([0, 0.8, 0, 120, 0, -30])]
-    image, plane, xyz, seen = [], [], [], []
-    for i in (0, 2):  # nothing is left of image 1
-        for k, world_from_plane in enumerate(planes):
-            at = poses[i] @ (world_from_plane @ grid)
-            image += [i] * len(grid)
-            plane += [k] * len(grid)
-            xyz.append(grid)
-            seen.append(1000.0 * at[:, :2] / at[:, 2:])
+    image, plane = np.repeat([(i, k) for i in (0, 2) for k in range(2)], len(grid), axis=0).T  # nothing of image 1
+    xyz = np.concatenate([poses[i] @ (world_from_plane @ grid) for i in (0, 2) for world_from_plane in planes])
     off = Rigid.exp([2e-3, -1e-3, 1e-3, 0.5, 0.3, 1.0])
     start = Poses.of(pose @ off for pose in poses)
-    points = np.array(image), np.array(plane), np.concatenate(xyz), np.concatenate(seen), 1000.0
+    points = image, plane, np.tile(grid, (4, 1)), 1000.0 * xyz[:, :2] / xyz[:, 2:], 1000.0
     found, world_from_plane = adjusted_planes(start, Poses.of([planes[0], planes[1] @ off]), *points)
     for i in (0, 2):
         np.testing.assert_allclose(found[i].matrix(), poses[i].matrix(), atol=1e-6)

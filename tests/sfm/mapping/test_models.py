@@ -314,11 +314,7 @@ def test_a_name_with_a_space_in_a_text(saved, model):
 
 @pytest.mark.parametrize(
     ("name", "places", "words"),
-    [
-        ("points3D", [1], ["1e300"]),
-        ("frames", [6], ["nan"]),
-        ("frames", range(2, 6), "0000"),
-    ],
+    [("points3D", [1], ["1e300"]), ("frames", [6], ["nan"]), ("frames", range(2, 6), "0000")],
 )
 def test_points_and_poses_that_are_no_places(saved, model, name, places, words):
     path = model.as_text() / f"{name}.txt"
@@ -369,13 +365,8 @@ def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
             own_copy(source, folder)
             (folder / f"{name}.bin").write_bytes(content)
             cases.append((str(folder), name))
-    done = subprocess.run(
-        [sys.executable, "-c", READ_ALL],
-        input=json.dumps([folder for folder, _ in cases]),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    command, folders = [sys.executable, "-c", READ_ALL], json.dumps([folder for folder, _ in cases])
+    done = subprocess.run(command, input=folders, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(answers) == len(cases) > 80
