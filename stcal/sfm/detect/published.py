@@ -107,7 +107,7 @@ def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
     cosine = direction @ diagonal / (np.linalg.norm(direction) * np.linalg.norm(diagonal))
     if abs(cosine) < ZERO_COSINE:
         return 0, 0
-    return int(np.sign(cosine)), int(np.sign(np.linalg.det([diagonal, direction])))
+    return int(np.sign(cosine)), int(np.sign(diagonal[0] * direction[1] - diagonal[1] * direction[0]))
 
 
 def detect_published(
