@@ -87,9 +87,9 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
     off = np.abs(at[:, 2] - at[0, 2])
     for place, angle, height in zip(places, tilt, off, strict=True):
         if angle > FLAT_RAD or height > FLAT_MM:
-            off = f"{place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle"
+            fault = f"{place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle"
             remedy = "none allowed: targets are flat here; give the tags of one plane"
-            raise InputError("E-LAYOUT-FLAT", f"{where}: {off}, {remedy}")
+            raise InputError("E-LAYOUT-FLAT", f"{where}: {fault}, {remedy}")
     corners_of_one = UPRIGHT if data.upright or is_of_apriltag(data.tag_family) else CORNERS
     tags = []
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):

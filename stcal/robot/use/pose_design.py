@@ -51,7 +51,9 @@ class PoseDesign(Brief):
     """The chosen poses, compared with random sets of as many.
 
     ``q`` : (count, n) joint vectors, of which the first alone are a good set too; ``poses`` : base_from_tool there;
-    :class:`DesignFile` describes the other fields.
+    ``parameters``, ``seen`` : how many there are, and how many (in combination) the candidates show, of which the
+    indices ``chosen`` and ``random`` are; ``sigma_mm`` : σ of the position that the identified robot will predict, RMS
+    per axis over random poses; ``random_sigma_mm`` : median of the random sets; ``exchanges`` : after the first choice.
     """
 
     format: ClassVar = "stcal pose design 1"
