@@ -361,7 +361,8 @@ class CornerBoard(LatticePart):
 
     def xy_mm(self) -> np.ndarray:
         """Return the positions of the points, (n, 2), mm."""
-        return self.places_mm(self.labels())[:, :2]
+        row, column = self.cells().T
+        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row]])
 
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
         """Return the positions of these points, (n, 3), board frame."""

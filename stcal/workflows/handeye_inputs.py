@@ -75,12 +75,11 @@ def robot_at_images(robot: PoseSide, names: Sequence[str], files: "Files") -> tu
         raise InputError("E-POSES-UNMATCHED", f"{where}: no image has a pose: {': '.join(taken.left_out[0])}")
     kept = tuple(seen[i] for i in taken.rows)
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    robot = replace(
-        robot[taken.rows], poses=taken.base_from_flange, names=kept, covariance=None, own=False, timed=False
-    )
     places, lines = tuple(f"time of {name}" for name in kept), f"{robot.understood}{note}; {taken.said}"
+    told = {"places": places, "understood": lines, "covariance": None, "own": False, "timed": False}
     untimed_images = tuple((name, f"no time in {files.image_times}") for name in names if name not in images)
-    return replace(robot, places=places, understood=lines), taken.left_out + untimed_images, (stream, seconds)
+    at_images = replace(robot, poses=taken.base_from_flange, names=kept, **told)
+    return at_images, taken.left_out + untimed_images, (stream, seconds)
 
 
 def _times_of_images(names: Sequence[str], stated_in: Path | None) -> dict[str, Decimal] | None:
@@ -190,11 +189,16 @@ class Files:
     image_times: Path | None = None
     time_offset: bool = False
 
+    def _folder(self) -> Path | None:
+        """Returns the folder of the images; None for files of poses."""
+        source = self.source if self.second is None else None
+        return source if isinstance(source, Path) and source.is_dir() else None
+
     @one_thread()
     def read(self, workers: int | None = None, progress: Progress | None = None) -> HandEyeInput:
         """Returns the pairs of poses, and the views of the board if there are images."""
-        if isinstance(self.source, Path) and self.source.is_dir():
-            return _Photographs(self, self.source).pairs(workers, progress or (lambda *_: None))
+        if folder := self._folder():
+            return _Photographs(self, folder).pairs(workers, progress or (lambda *_: None))
         return self._pairs(*self._joined())
 
     def _joined(self) -> tuple[Source, tuple[str, ...]]:
@@ -244,9 +248,8 @@ class Files:
 
     def dry_run(self) -> list[str]:
         """Returns lines on how the inputs are understood, without looking for the board in images."""
-        source = self.source
-        if isinstance(source, Path) and source.is_dir():
-            own = _Photographs(self, source)
+        if folder := self._folder():
+            own = _Photographs(self, folder)
             stated, flange = self.statements.setup, own.robot.poses[list(own.row_of.values())]
             lines, left_out = own.understood + own.lines, own.left_out
             with_pose = f"{len(own.row_of)} of {len(own.images)}"

@@ -22,7 +22,9 @@ GRID = AprilGridDesign(3, 4, 30.0, 0.3)
 @cache
 def photographed(board: AprilGridDesign, border: int, squares: bool = True) -> tuple[np.ndarray, np.ndarray]:
     sheet, origin = aprilgrid_mm(board, border, squares)
-    return photograph(sheet, 4, IMAGE_FROM_MM), origin
+    image = photograph(sheet, 4, IMAGE_FROM_MM)
+    image.flags.writeable = False  # several tests share it
+    return image, origin
 
 
 def off_px(view, origin) -> np.ndarray:

@@ -70,6 +70,8 @@ def test_a_hidden_corner_is_left_out(sharp):
     view = find_charuco(hidden, "a", BOARD)
     assert len(view) > 0.8 * len(whole)
     assert errors_px(view).max() < 1.0
+    wrong = replace(CAMERA, focal=[500.0, 500.0])  # no camera changes the corners
+    assert np.array_equal(find_board(sharp, "a", wrong, BOARD)[0].xy_px, whole.xy_px)
 
 
 @pytest.mark.slow

@@ -220,6 +220,7 @@ WRONG_BOARDS = {
     "dots that touch": (changed("radius_mm = 7.5", "radius_mm = 15", BOARD), "E-BOARD-RADIUS … 15"),
     "zero sigma": (BOARD + "sigma_mm = 0\n", "E-KEY-VALUE … sigma_mm … 0 … 0"),
     "corner inside": (BOARD + corner(3, 3), "E-BOARD-CORNER … 3 … 3"),
+    "a ring off the board": ("rings = [[99, 0]]\n" + BOARD, "E-BOARD-RINGS … [99, 0]"),
     "corner outside": (BOARD + corner(0, 9), "E-BOARD-CORNER … 0 … 9"),
     "corner no larger": (BOARD + corner(0, 0, 8), "E-BOARD-CORNER … 8 … 8.625 … 22.5"),
     "corner touches": (BOARD + corner(0, 0, 22.5), "E-BOARD-CORNER … 22.5 … 8.625 … 22.5"),

@@ -186,6 +186,12 @@ def test_the_covariance_of_a_product_is_that_of_drawn_products():
     assert np.abs((np.diag(seen) / np.diag(chain.covariance)) - 1).max() < 0.05
 
 
+def test_a_difference_is_the_motion_in_frame_a():
+    step, pose = np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]), Rigid.exp([0.4, 0.5, -0.6, 7, 8, 9])
+    moved = Rigid(Rigid.exp([*step[:3], 0, 0, 0]).rotation @ pose.rotation, pose.translation + step[3:])
+    np.testing.assert_allclose(moved.difference(pose), step, atol=1e-12)
+
+
 def test_exact_poses_stay_exact():
     one = UncertainRigid.exact(Rigid(np.eye(3), [1.0, 2.0, 3.0]))
     assert ((one @ one).covariance == 0).all()

@@ -173,7 +173,7 @@ def test_errors_of_a_stated_pair_are_said_and_widen_sigma():
 
 
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("seed", sampled(range(3)))
+@pytest.mark.parametrize("seed", sampled(range(3), (0, 1)))
 def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
     truth = simulated(np.random.default_rng(seed), 5, setup, (5e-3, 2.0), (2e-3, 0.5))
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[setup]

@@ -296,7 +296,7 @@ def test_the_distance_that_a_body_needs_is_named():
 
 
 def test_more_images_and_a_known_distance_help_a_planned_body():
-    planned = plan(PlanOptions(images=6, distance_mm=300, width=900, seed=1), THREE)
+    planned = plan(PlanOptions(images=12, distance_mm=300, width=900, seed=1), tag_cube(60))
     worst = planned.forecast.worst()[1]
     remedies = {remedy.what: remedy.sigma_mm for remedy in planned.remedies}
     assert set(planned.shares["2"]) == {"image noise", "print", "flatness", "intrinsics"}

@@ -95,7 +95,6 @@ def test_a_face_that_is_off_would_be_seen(calibrated, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("calibrated", ["sample"], indirect=True)
 def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, tmp_path):
     """Measured in the same photographs with the faces just found; board dots are told apart by the board's file.
 

@@ -10,7 +10,16 @@ from stcal.boards.finders import find_on_faces
 from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.synthetic.body_scene import BLACK, WHITE, BodyOptions, body_camera, drawing_of, make_body_scene, render_body
+from stcal.synthetic.body_scene import (
+    BLACK,
+    WHITE,
+    BodyOptions,
+    body_camera,
+    covered_share,
+    drawing_of,
+    make_body_scene,
+    render_body,
+)
 from stcal.synthetic.designs import tag_cube
 
 TIE_MM = 70.0  # side of a cube whose tags have edges in the middle between two pixels of their drawing
@@ -82,3 +91,10 @@ def test_a_tag_that_is_tilted_too_far_is_named():
     (note,) = [note for note in notes if "tilted" in note]
     assert note.startswith(f"face {face}: a tag is tilted by 7")
     assert "up to 70° is measured" in note
+
+
+def test_the_share_that_an_area_covers_is_exact():
+    line = np.array([[2.25, 1.5], [7.5, 1.5], [7.5, 6.75], [2.25, 6.75]])
+    ends = ((10, 2.25, 7.5), (9, 1.5, 6.75))
+    x, y = (np.clip(np.minimum(np.arange(n) + 1, b) - np.maximum(np.arange(n), a), 0, 1) for n, a, b in ends)
+    np.testing.assert_allclose(covered_share([[line]], (9, 10)), np.outer(y, x), atol=1e-6)

@@ -117,7 +117,7 @@ def test_a_data_set_that_fails_leaves_no_folder(tmp_path, scene):
 
     folder = tmp_path / "new" / "set"
     with pytest.raises(RuntimeError, match="no"):
-        write_dataset(folder, scene, workers=1, progress=fails)
+        write_dataset(folder, scene, workers=2, progress=fails)
     assert not folder.exists()
 
 

@@ -295,10 +295,10 @@ def _of_camodocal(keys: Keys) -> Lens:
 
 def _of_industrial(keys: Keys) -> CameraModel:
     """Return the camera of ROS-Industrial; its lens may have distortion, though the form has none."""
-    keys.left.update(keys.left.pop("intrinsics"))  # type: ignore[call-overload]
-    lens = [keys.number(name) for name in ("fx", "fy", "cx", "cy")]
+    own = Keys(dict(keys.left.pop("intrinsics")))  # type: ignore[call-overload]
+    lens = [own.number(name) for name in ("fx", "fy", "cx", "cy")]
     width, height, _ = keys.size()
-    require_known(keys.left, undistorted=True)
+    require_known(keys.left | own.left, undistorted=True)
     return camera_model(np.array(lens), "OPENCV", width or None, height or None)
 
 

@@ -165,7 +165,7 @@ def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
     """Returns the row without β that gives this pose, or None; only its d and θ unless ``across_too``."""
     if modified and across_too:  # the way back along a standard row
         back = _row_of(pose.inverse(), modified=False, across_too=True)
-        return None if back is None else DHRow(-back.a, -back.alpha, -back.d, -back.theta)
+        return None if back is None else DHRow(0.0 - back.a, 0.0 - back.alpha, 0.0 - back.d, 0.0 - back.theta)  # not −0
     r, p = pose.rotation, pose.translation
     if not across_too:
         row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))

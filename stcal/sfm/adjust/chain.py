@@ -8,12 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, MappingError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import UNKEPT
+from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
@@ -301,27 +300,37 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
 def _adjust(
     faces: Sequence[FaceInGroup], from_face: dict[str, Rigid], from_group: dict[str, Rigid], reference: str
 ) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Estimates the poses of faces and groups in the target frame."""
-    a, seen = Adjustment(), Poses.of([own.group_from_face for own in faces])
-    by_face = a.block("face", Poses.of(from_face.values()), fixed=[list(from_face).index(reference)])
-    by_group = a.block("group", Poses.of(from_group.values()))
-    face = np.array([list(from_face).index(own.face) for own in faces])
-    group = np.array([list(from_group).index(own.group) for own in faces])
+    """Estimates the poses of faces and groups in the target frame. Poses are perturbed on the right, so that the step
+    of a face enters its residual with the factor −1."""
     roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
     for own in faces:
         by_pose = np.concatenate([-skew(own.xyz_face), np.broadcast_to(np.eye(3), (len(own.labels), 3, 3))], axis=2)
         information = np.einsum("nki,nkl,nlj->ij", by_pose, own.information, by_pose)
         roots.append(np.linalg.cholesky(information + 1e-12 * np.eye(6)).T)
+    free = [("face", f) for f in from_face if f != reference]
+    free += [("group", g) for g in dict.fromkeys(own.group for own in faces)]
+    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(free)}
+    initial = {("face", f): pose for f, pose in from_face.items()} | {("group", g): p for g, p in from_group.items()}
 
-    def apart(target_from_face: Poses, target_from_group: Poses) -> np.ndarray:
-        return (target_from_face[face].inverse() @ target_from_group[group] @ seen).difference(Poses.of([Rigid()]))
+    def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
+        jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
+        for k, (own, root) in enumerate(zip(faces, roots, strict=True)):
+            rows, group, face = slice(6 * k, 6 * k + 6), ("group", own.group), ("face", own.face)
+            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ own.group_from_face).log()
+            r, t = own.group_from_face.rotation.T, own.group_from_face.translation
+            jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
+            if face in column:
+                jacobian[rows, column[face]] = -root
+        return NormalEquations.of(residual, jacobian)
 
-    a.factor(apart, [(by_face, face), (by_group, group)], root=np.array(roots))
+    def moved(poses: dict[tuple[str, str], Rigid], step: np.ndarray) -> dict[tuple[str, str], Rigid]:
+        return poses | {name: poses[name] @ Rigid.exp(step[at]) for name, at in column.items()}
+
+    solution = minimise(initial, linearise, moved)
     # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
     # iteration ends when they gain nothing.
-    remedy = "check that nothing but the camera moved in a group"
-    values = a.minimum().required("faces", remedy, accepted=UNKEPT).state
-    return dict(zip(from_face, values["face"], strict=True)), dict(zip(from_group, values["group"], strict=True))
+    poses = solution.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
+    return {f: poses["face", f] for f in from_face}, {g: poses["group", g] for g in from_group}
 
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:

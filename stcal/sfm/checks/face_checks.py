@@ -172,13 +172,18 @@ def loops_check(evidence: Evidence, joint: JointResult) -> Check:
         if not set(first.groups) & set(second.groups)
     ]
 
-    @cache  # several ways share a group, and a step
-    def alone(group: str) -> JointResult:
-        return _adjusted(evidence, joint, (model for model in models if model.group == group))
+    @cache  # several ways share a group, also one that fails by itself, and a step
+    def alone(group: str) -> JointResult | StcalError:
+        try:
+            return _adjusted(evidence, joint, (model for model in models if model.group == group))
+        except StcalError as error:
+            return error
 
     @cache
     def step_of(group: str, a: str, b: str) -> UncertainRigid:
-        target = _posed(evidence, alone(group), (a, b))
+        if isinstance(part := alone(group), StcalError):
+            raise part
+        target = _posed(evidence, part, (a, b))
         return UncertainRigid(target.target_from_face[b], target.face_covariance[b])
 
     def along(way: FaceChain) -> UncertainRigid:

@@ -121,16 +121,14 @@ class Arrangement:
         return sum(len(view.rows) for views in self.views.values() for view in views)
 
 
-def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float = 0.0) -> Arrangement:
-    """Arrangement that explains most circles; ``step_mm`` between circles is the least error of a wrong reading. With a
-    focal length, arrangements are adjusted to the circles, and all readings compared with them."""
+def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float) -> Arrangement:
+    """Arrangement that explains most circles; ``step_mm`` between circles is the least error of a wrong reading."""
     total = sum(len(views[0].rows) for readings in images for views in readings if views[0].named)
     best = Arrangement({}, {}, {})
     for i, reading in _seeds(images):
         if any(reading is view for view in best.views.get(i, ())):
             continue  # a start with this image gives the same arrangement
-        found = _grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm)
-        found = _checked(images, found, step_mm, focal_px) if focal_px else found
+        found = _checked(images, _grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm), step_mm, focal_px)
         best = max(best, found, key=Arrangement.explained)
         if best.explained() >= total:
             break
@@ -152,7 +150,9 @@ def across_groups(groups: Sequence[Arrangement], step_mm: float) -> list[Arrange
     """Compares the arrangements, as faces have the same relative poses in all groups. A face that most groups have
     elsewhere is removed, and the last face with the others: alone it may be mirrored. A face known from other groups is
     added; the second look decides."""
-    best = arrange([_as_faces(group) for group in groups], step_mm)
+    faces = [_as_faces(group) for group in groups]
+    grown = (_grown(faces, i, view, MAX_SHIFT_PITCHES * step_mm) for i, view in _seeds(faces))
+    best = max((Arrangement({}, {}, {}), *grown), key=Arrangement.explained)
     settled = list(groups)
     for i, views in best.views.items():
         group, pose, agreed = groups[i], best.camera_from_group[i], {view.plane for view in views}

@@ -83,8 +83,11 @@ class Fits:
         self.low = np.maximum(np.floor(place - half).astype(int), 0)
         self.high = np.minimum(np.ceil(place + half).astype(int) + 1, image.shape[::-1])
         # columns and rows of each box, px from its ellipse
-        boxes = zip(self.low.tolist(), self.high.tolist(), place, strict=True)
-        self.offset = [[(np.arange(*r) - c).astype(np.float32) for *r, c in zip(*box, strict=True)] for box in boxes]
+        across, down = (
+            [(np.arange(*ends) - at).astype(np.float32) for *ends, at in zip(low, high, middle, strict=True)]
+            for low, high, middle in zip(self.low.T, self.high.T, place.T, strict=True)
+        )
+        self.offset = list(zip(across, down, strict=True))
         self.jacobian = to_ideal[:, :, 1:3] / half[:, None]
         m = self.jacobian @ ellipses.shape_px
         value, vector = np.linalg.eigh(m @ np.swapaxes(m, 1, 2))

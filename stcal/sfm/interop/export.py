@@ -95,7 +95,8 @@ class Content:
             return [*lines, f"no sigma: solved by {faces.solve}, which states none"]
         for face in faces.target_from_face:
             um, mdeg = (" ".join(number(v, 2 + k) for v in own) for k, own in enumerate(self.face_sigma(face)))
-            text = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
+            text = f"sigma x y z {um} um, about x y z {mdeg} mdeg" if um else "no sigma"
+            text = "reference" if face == faces.reference_face else text
             lines.append(f"face {face}: {text}")
         return lines
 

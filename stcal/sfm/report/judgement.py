@@ -129,13 +129,17 @@ def judgement_of(report: dict) -> Judgement:
     )
 
 
+def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
+    """Returns the rows of the faces without σ, which a failed run must not show."""
+    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
+    return {name: face | none for name, face in faces.items()}
+
+
 def without_sigma(report: dict) -> dict:
     """Returns the content of ``report.json`` without the σ of faces, which a failed run must not show."""
-    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
-    faces = {name: face | none for name, face in report["faces"].items()}
     between = [row | {"distance_sigma_um": None} for row in report["between_faces"]]
     summary = report["summary"] | {"scale_sigma_ppm": None}
-    return report | {"faces": faces, "between_faces": between, "summary": summary}
+    return report | {"faces": without_sigma_of(report["faces"]), "between_faces": between, "summary": summary}
 
 
 def _faces(names: list[str]) -> str:

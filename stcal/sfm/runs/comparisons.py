@@ -169,7 +169,11 @@ class Tolerances:
         return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
 
     def __post_init__(self):
-        require_fields(self, "tolerances", **dict.fromkeys(asdict(self), 0))
+        for name, value in asdict(self).items():
+            if isinstance(value, int | float) and not 0 <= value < np.inf:
+                fault = f"tolerance {name} {value:g}: a number of 0 or more needed"
+                raise InputError("E-OPTION-RANGE", f"{fault}; give another")
+        require_fields(self, "tolerances")
 
 
 def allowed_text(tolerances: Tolerances) -> str:

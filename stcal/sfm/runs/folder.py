@@ -48,7 +48,7 @@ from stcal.sfm.detect.predict import CUT, REMEDIES
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.check import BY_CHANCE, count_verdicts, ranked
-from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
+from stcal.sfm.report.judgement import QUESTIONS, judgement_of, without_sigma_of
 from stcal.sfm.report.run_page import (
     CONTROL,
     FIRST_IMAGES,
@@ -58,7 +58,7 @@ from stcal.sfm.report.run_page import (
     report_html,
     shown_overlays,
 )
-from stcal.sfm.runs.report_file import ReportFile, report_of
+from stcal.sfm.runs.report_file import ReportFile, face_row, report_of
 from stcal.sfm.runs.saved import AnyRun, RunResult, SavedRun
 from stcal.sfm.runs.stages import DetectedImages, Task
 from stcal.sfm.runs.transaction import AGAIN, added_results, as_written, require_run, verify
@@ -290,12 +290,12 @@ def run_text(result: RunResult) -> str:
 
 def document_of(result: RunResult) -> Document:
     """Returns the result of a run in short: the verdict, faces with σ, checks that did not pass, and remarks."""
-    judgement, comparison = Judgement.model_validate(result.report["judgement"]), result.comparison
-    faces = (without_sigma(result.report) if judgement.verdict == "no" else result.report)["faces"]
-    first, *others = judgement.answers()
-    blocks: list[Block]
+    verdict, *others = [] if result.judgement is None else result.judgement.answers()
+    faces = {face: face_row(result, face) for face in result.target.target_from_face}
     if faces:
-        blocks = [faces_table(faces, result.target.reference_face)]
+        failed = result.judgement is not None and result.judgement.verdict == "no"
+        shown = without_sigma_of(faces) if failed else faces
+        blocks: list[Block] = [faces_table(shown, result.target.reference_face)]
     else:
         rows = [
             [name, len(s.labels)]
@@ -312,19 +312,20 @@ def document_of(result: RunResult) -> Document:
     doubtful = [check for check in ranked(result.checks, names) if check.verdict in ("failed", "suspicious")]
     blocks += [f"checks: {count_verdicts(result.checks)} ({BY_CHANCE})"] if doubtful else []
     blocks += [f"{c.verdict}: {c.title}: {c.reason}{'; ' * bool(c.remedy)}{c.remedy}" for c in doubtful]
-    if comparison is not None:
+    if result.comparison is not None:
         blocks += [
             "compared with Zhang & Wei (2017): distance of faces from the last row's, three-point frames; steps add up",
-            Table(*comparison_cells(comparison.model_dump())),
-            *(f"{row.method}: {row.reason}" for row in comparison.rows if row.reason),
+            Table(*comparison_cells(result.comparison.model_dump())),
+            *(f"{row.method}: {row.reason}" for row in result.comparison.rows if row.reason),
         ]
     blocks.append(Printed([*result.notes, *_remarks(result)]))
     if (out := result.out) is not None:
         written = [f"faces:  {out / 'faces.json'}"] if faces else []
         written += [f"camera: {out / files.REFINED_CAMERA}, as adjusted, with σ"] if result.refined_camera else []
         blocks.append(Printed([*written, f"report: {out / 'report.html'}"]))
+    first = " ".join(verdict) if verdict else QUESTIONS["use"] + " It was not judged."
     answers = [f"{question} {answer}" for question, answer in others]
-    return Document(result.target_design.name, " ".join(first), [Section("", blocks, terminal=True)], answers)
+    return Document(result.target_design.name, first, [Section("", blocks, terminal=True)], answers)
 
 
 def _remarks(result: RunResult) -> Iterator[str]:

@@ -3,11 +3,11 @@ group, each of which is cached by its inputs."""
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import numpy as np
@@ -51,7 +51,7 @@ from stcal.sfm.runs.run_options import RunOptions, is_vague, require_dots
 from stcal.sfm.runs.transaction import RunFolder
 
 CACHE_VERSION = 8
-LEAST_WITHOUT, MOST_WITHOUT = 3, 40  # images of a group above and up to which one that contradicts is looked for
+LEAST_WITHOUT, MOST_WITHOUT = 3, 40  # one that contradicts is sought in groups of more than 3 and up to 40 images
 UNSOLVED = (MappingError, ScaleError, ConvergenceError, DegenerateError)  # a group has no solution, others may
 LIKELY = "; the likely cause: "  # then what the photographs that cannot be solved have in common
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
@@ -392,12 +392,16 @@ def _solve_groups(task: Task, groups: Groups, names: Collection[str]) -> tuple[d
     step = counted(task.progress, "map", len(inputs))
     for _ in range(len(inputs) - len(pending)):
         step(None)
-    with TemporaryDirectory(prefix="", dir=task.folder.stage, ignore_cleanup_errors=True) as scratch:
-        jobs = [(inputs[name], Path(scratch) / str(k)) for k, name in enumerate(pending)]
+    scratch = task.folder.stage / "scratch"
+    scratch.mkdir()
+    try:
+        jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
         for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[name] = solution
             if isinstance(solution, GroupSolution):
                 _save(paths[name], solution)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
     def with_scale(name: str) -> GroupSolution:
         solution = found[name]

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses
+from stcal.handeye.data.pose_content import PoseSide
 from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
+from stcal.workflows.handeye_inputs import Files, robot_at_images
 from tests.outcome import fails_with
 from tests.support.handeye import disturbed
 from tests.support.handeye_stream import trajectory
@@ -80,3 +82,14 @@ def test_streams_that_are_none():
         Stream.of([Decimal(1)], trajectory(np.zeros(1), PHASE), "robot.csv")
     with fails_with("E-TIMES-REPEATED … 1"):
         Stream.of([Decimal(1), Decimal(2), Decimal(1)], trajectory(np.arange(3.0), PHASE), "robot.csv")
+
+
+def test_more_images_than_samples():
+    times = np.arange(5) * 0.1
+    samples = trajectory(times, PHASE)
+    places = tuple(f"line {k + 2}" for k in range(5))
+    robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
+    seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
+    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
+    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
+    assert np.abs(at.poses.difference(trajectory(seconds, PHASE))).max() < 0.01

@@ -43,7 +43,7 @@ def test_refinement_from_scratch_finds_the_eccentricity(scene, labels_only):
     """Without noise the corrected model is the true one: eccentricity is modelled, not fitted away."""
     observed = labels_only.observations(scene, 0.0, np.random.default_rng(0))
     board = reference_board()
-    for start in labels_only.models(scene, observed, unit_mm=37.0)[:2]:
+    for start in labels_only.models(scene, observed, unit_mm=37.0)[::3]:
         refined = refine(start, scene.camera, scene.target, board)
         assert refined.outliers == ()
         assert 0.02 < np.abs(refined.model.shift_px).max() < 0.2

@@ -175,6 +175,7 @@ def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     assert found.fields == dict.fromkeys(FIELDS, "") | given
     conditions = conditions_of(found, saved.board_design)
     assert (conditions.correction, conditions.temperature_c) == (pytest.approx(32e-6), None)
+    assert "a correction of +32.0 ppm" in conditions.words
 
 
 WARM_BOARD = StatedSize(expansion_ppm_per_k=8.5, temperature_c=22.7)

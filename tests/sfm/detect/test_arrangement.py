@@ -10,6 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.sfm.data.group_model import Centres
 from stcal.sfm.data.patterns import patterns_of
+from stcal.sfm.detect.arrangement import Arrangement, PlaneView, across_groups
 from stcal.sfm.detect.candidates import BoardSighting, FaceSighting, ImageDetection
 from stcal.sfm.detect.labelling import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
@@ -265,3 +266,22 @@ def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
 def test_without_a_board_the_target_is_labelled_all_the_same(scene, group):
     (((results, _),), _) = label_groups([[("12/0", "12", Seen(group[0]).detection())]], scene.target, None, FOCAL_PX)
     assert {label.plane for label in results[0].observations.labels} == {"1", "2"}
+
+
+def test_of_faces_compared_across_groups_only_the_moved_one_is_left_out():
+    """Also the largest face of the group that shows most, which is the first to be compared."""
+    grid = np.stack(np.divmod(np.arange(16), 4), axis=1) * 20.0
+    poses = {"1": Rigid(), "2": Rigid.exp([0, 1.2, 0, 100, 0, -60.0]), "3": Rigid.exp([1.2, 0, 0, 0, 100, -60.0])}
+
+    def group(k: int) -> Arrangement:
+        moved = {"3": Rigid.exp([0, 0, 0, 0, 30.0, 0]) @ poses["3"]} if k == 0 else {}
+        placed = {face: Rigid.exp([0.1 * k, 0.2, 0, 10 * k, 0, 500.0]) @ pose for face, pose in (poses | moved).items()}
+        counts = {"1": 12, "2": 12, "3": 16}
+        views = tuple(
+            PlaneView(face, tuple(f"{face}:{i}" for i in range(n)), np.arange(n), grid[:n], grid[:n] / 1000, n, Rigid())
+            for face, n in counts.items()
+        )
+        return Arrangement(placed, {0: Rigid()}, {0: views})
+
+    settled = across_groups([group(k) for k in range(3)], 20.0)
+    assert [sorted(view.plane for view in each.views[0]) for each in settled] == [["1", "2"], [*"123"], [*"123"]]

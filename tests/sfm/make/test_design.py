@@ -52,6 +52,8 @@ def test_each_face_is_named_with_any_three_circles_hidden_and_no_four_are_alike_
             assert is_named(face, set(range(len(face.ids))) - set(gone), target)
         for other in target.faces:
             assert in_common(face, other, mirrored=True) == 0
+        middle = face.rough_target_from_face @ np.append(face.outline_mm.mean(0), 0.0)
+        assert middle @ face.rough_target_from_face.rotation[:, 2] > 0.49 * min(SIZE)  # outwards, on the box
 
 
 class Alike(TargetDesign):

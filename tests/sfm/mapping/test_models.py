@@ -356,25 +356,25 @@ def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
         cuts = [0, 1, 8, len(data) - 1, *(rng.randrange(8, len(data)) for _ in range(8))]
         spoilt = [data[:cut] for cut in cuts] + [data + b"\0", data + data]
         spoilt += [n.to_bytes(8, "little") + data[8:] for n in (0, 2, 2**31, 2**40, 2**64 - 1)]
-        if at := {"points3D": 8 + 43, "images": 8 + 64 + len("12/IMG_1000.jpg\0")}.get(
-            name
-        ):  # its track, its keypoints
+        at = {"points3D": 8 + 43, "images": 8 + 64 + len("12/IMG_1000.jpg\0")}.get(name)  # its track, its keypoints
+        if at is not None:
             spoilt.append(data[: at + 5] + b"\1" + data[at + 6 :])
         for i, content in enumerate(spoilt):
-            if content[:8] == data[:8] and len(content) == len(data):
+            if content == data:
                 continue
             folder = tmp_path / f"{name}{i}"
             own_copy(source, folder)
             (folder / f"{name}.bin").write_bytes(content)
-            cases.append((str(folder), name))
-    command, folders = [sys.executable, "-c", READ_ALL], json.dumps([folder for folder, _ in cases])
+            cases.append((str(folder), name, i == len(cuts) + 2 + 5))
+    command, folders = [sys.executable, "-c", READ_ALL], json.dumps([folder for folder, *_ in cases])
     done = subprocess.run(command, input=folders, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(answers) == len(cases) > 80
-    for (folder, name), (_, said, seconds) in zip(cases, answers, strict=True):
+    for (folder, name, is_inside), (_, said, seconds) in zip(cases, answers, strict=True):
         assert said.startswith(f"model {folder}: damaged or incomplete ({name}.bin"), said
         assert said.endswith("; write or copy it again")
+        assert "ends too soon" in said or not is_inside, said
         assert seconds < 5, said
 
 

@@ -21,7 +21,7 @@ from stcal.sfm.adjust.joint import adjusted, unmoved
 from stcal.sfm.data.group_model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning import session
-from stcal.sfm.planning.advise import KnownRun, PlannedView, advise, candidates, doubts, known_of, known_scene
+from stcal.sfm.planning.advise import GRID_DEG, KnownRun, PlannedView, advise, candidates, doubts, known_of, known_scene
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
@@ -177,7 +177,8 @@ def known(exact) -> KnownRun:
 
 
 def look_coarsely(patch: pytest.MonkeyPatch) -> None:
-    """Few candidates, 25° apart, compared in this process: others would not know of it."""
+    """Few candidates, 25° in place of 10° apart, compared in this process: others would not know of it."""
+    assert GRID_DEG == 10.0  # what users get
     patch.setattr("stcal.sfm.planning.advise.GRID_DEG", 25.0)
     patch.setattr("stcal.sfm.planning.advise.kept_processes", nullcontext)
 
