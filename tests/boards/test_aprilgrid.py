@@ -14,6 +14,8 @@ from stcal.geometry.plane import apply_homography
 from stcal.workflows import board_views
 from tests.boards.drawn import IMAGE_FROM_MM, aprilgrid_mm, photograph
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(1200, 900, [1500, 1500], [600, 450], np.zeros(8))
 CORNER_PX = 0.12  # as in the tests of the other boards
 GRID = AprilGridDesign(3, 4, 30.0, 0.3)
@@ -71,7 +73,6 @@ def test_a_part_is_enough():
     assert np.abs(off_px(view, origin)).max() < CORNER_PX
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "said"),
     [

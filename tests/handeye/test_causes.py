@@ -29,6 +29,8 @@ from tests.support.handeye import (
 )
 from tests.support.handeye_stream import simulated_stream
 
+pytestmark = pytest.mark.slow
+
 
 def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
     """Poses taken as if both clocks were one."""
@@ -37,7 +39,6 @@ def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
     return HandEyeInput("poses", pairs, timed=Timed(truth.stream, truth.seconds))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [-0.003, 0.015, *(pytest.param(each, marks=FULL) for each in (-0.02, 0.1))])
 def test_a_lag_is_told_with_what_it_explains(offset_s):
     """A doubt of the board's size ends with it."""
@@ -182,7 +183,6 @@ def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
     assert f"give --setup {setup} if it is that" in note
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["pose", "reprojection"])
 def test_poses_at_one_place_of_the_robot_count_once(method):
     """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of

@@ -26,6 +26,8 @@ from tests.support.handeye import (
     simulated,
 )
 
+pytestmark = pytest.mark.slow
+
 ONE_QUICK = ("eye-in-hand", pytest.param("eye-to-hand", marks=FULL))
 """Where the other setup is the same but for what its poses are called."""
 NOISE = {"robot": (3e-4, 0.1), "camera": (1e-3, 0.3)}
@@ -295,7 +297,6 @@ def test_sound_poses_do_not_move(sets, most):
     assert not any("two groups" in note for each in notes for note in each)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("sets", "least"), [(1, 1), pytest.param(10, 8, marks=FULL)])
 def test_rough_poses_that_fit_another_setup_better_are_said(sets, least):
     """Errors of 0.5° and 5 mm, and turns of few degrees: no setup fits well, but the right one is named."""
@@ -312,7 +313,6 @@ def test_rough_poses_that_fit_another_setup_better_are_said(sets, least):
     assert said >= least
 
 
-@pytest.mark.slow
 def test_three_hundred_poses_need_little_memory():
     """All pairs of motions are 45 000; a full singular basis of them would be 15 GB."""
     tracemalloc.start()

@@ -16,6 +16,8 @@ from stcal.register.workspace import GRID, MOST_POINTS, cubes, findings, residua
 from stcal.report.document import Section
 from tests.support.point_pairs import B_FROM_A
 
+pytestmark = pytest.mark.slow
+
 SIGMA = 0.05
 
 
@@ -40,7 +42,6 @@ def fitted(a, b):
     return found, residual_field(found, inputs(found, a, b))
 
 
-@pytest.mark.slow
 def test_noise_is_not_taken_for_a_field():
     """One case in a hundred may be: more than one of 8 has a chance of 0.3 %."""
     seen = 0
@@ -135,13 +136,11 @@ def test_cubes_by_hand():
     assert outer[3].mean_mm == pytest.approx(5 * 125 / 729, rel=0.05)
 
 
-@pytest.mark.slow
 def test_few_points_have_no_field_and_many_are_not_all_used():
     assert fitted(*bent(0, 5))[1] is None
     assert len(fitted(*bent(0, 3 * MOST_POINTS))[1].rows) == MOST_POINTS
 
 
-@pytest.mark.slow
 def test_points_in_the_cube_are_held_out():
     """Ten points in it: a fit to them has residuals 1 − 6/30 of the noise's square, held out it is above."""
     inside = []
@@ -248,7 +247,6 @@ def test_json_is_the_result(model):
     np.testing.assert_allclose(content["scales"], 1, atol=2e-3)
 
 
-@pytest.mark.slow
 def test_page_shows_outliers_and_escapes_names():
     page = registration_report(found_of(), [Section("One <more>", ["section"])]).page()
     assert "pairs &lt;a&amp;b&gt;.csv" in page

@@ -21,6 +21,8 @@ from stcal.synthetic.designs import tag_cube
 from tests.levels import sampled
 from tests.outcome import fails_with
 
+pytestmark = pytest.mark.slow
+
 CUBE = tag_cube(60.0)
 
 

@@ -41,6 +41,8 @@ from tests.levels import FULL, sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
 from tests.support.image_poses import pose_error
 
+pytestmark = pytest.mark.slow
+
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
 THREE = tag_body("cube", "60", "APRILTAG_36h11", 0, "1,2,3")
@@ -214,7 +216,6 @@ def test_images_of_one_tag_beside_circles_are_placed():
     assert np.degrees(off.angle_rad()) < 0.5
 
 
-@pytest.mark.slow
 def test_contributions_of_a_body_add_up_to_its_covariance():
     target = tag_cube(60, size_sigma_mm=0.1)
     scene, images = observed(target, 12, 8)
@@ -351,7 +352,6 @@ def first_images(count: int, folder: Path, to: Path) -> Path:
     return images
 
 
-@pytest.mark.slow
 def test_tags_of_other_dictionaries_or_ids_are_named(photographed, tmp_path, stcal_sfm):
     other = tag_cube(60.0, "DICT_5X5_100")
     target, out = written(tmp_path, target_toml(other)), tmp_path / "run"
@@ -361,7 +361,6 @@ def test_tags_of_other_dictionaries_or_ids_are_named(photographed, tmp_path, stc
     assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "tags ", "correct the ids")
 
 
-@pytest.mark.slow
 def test_a_run_of_photographs_without_board_and_camera(photographed, tmp_path, no_page):
     folder, scene = photographed
     result = pipeline.run(folder / "images", None, tmp_path / "r", folder / "target.toml", None, RunOptions())
@@ -387,7 +386,6 @@ def test_a_run_of_photographs_without_board_and_camera(photographed, tmp_path, n
         assert np.linalg.norm(pose.camera_from_target.translation - scene.camera_from_target[i].translation) < 2
 
 
-@pytest.mark.slow
 def test_few_photographs_end_in_a_line_or_a_result(photographed, tmp_path, no_page):
     """As many as one takes first: what they do not determine is an error, what they do not test is "not possible"."""
     folder, solved, refusals = photographed[0], 0, []
@@ -416,7 +414,6 @@ def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
     assert known.mm == pytest.approx(apart, abs=1e-6)
 
 
-@pytest.mark.slow
 def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path, no_page):
     """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
     options = BodyOptions(images=7, distance_mm=420, seed=4, noise=0.005)

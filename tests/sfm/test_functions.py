@@ -18,6 +18,8 @@ from stcal.sfm.planning.session import plan_text
 from tests.outcome import fails_with, refuses
 from tests.shared import own_copy
 
+pytestmark = pytest.mark.slow
+
 
 def written_json(stcal_sfm, out, *words) -> dict:
     assert stcal_sfm(*words, "--json", out)[0] == 0

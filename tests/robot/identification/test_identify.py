@@ -24,6 +24,8 @@ from tests.outcome import fails_with, refuses
 from tests.scripts import load_script
 from tests.support.arms import TOOL, WORLD, seen_arm
 
+pytestmark = pytest.mark.slow
+
 LENGTHS = [0, 2]
 
 
@@ -35,7 +37,6 @@ def zeros_off():
     return true, measured(true, joint_vectors(true, 30, rng), rng)
 
 
-@pytest.mark.slow
 def test_zeros_alone_are_found_and_nothing_else_moves():
     true, data = zeros_off()
     found = identify(mh80(), data, IdentifyOptions(adjust="zeros", folds=0))
@@ -51,7 +52,6 @@ def test_zeros_alone_are_found_and_nothing_else_moves():
     assert identify(mh80(), data[:4], IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
-@pytest.mark.slow
 def test_fixed_dimensions_stay_and_are_said(tmp_path):
     true, data = seen_arm(np.random.default_rng(2), 40)
     assert abs(true.rows[1].a - mh80().rows[1].a) > 0.01
@@ -110,7 +110,6 @@ def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
     assert next(iter(found.state.stations)) == "A"
 
 
-@pytest.mark.slow
 def test_rows_of_another_station_and_a_station_of_two_rows_are_refused():
     data = stationed("position")
     names = list(data.stations)
@@ -120,7 +119,6 @@ def test_rows_of_another_station_and_a_station_of_two_rows_are_refused():
     refuses("E-STATION-FEW … 2", identify, mh80(), stationed("position", second=2))
 
 
-@pytest.mark.slow
 def test_distances_of_positions_go_within_stations():
     found = identify(mh80(), stationed("position"), IdentifyOptions(observe="distance", folds=0))
     assert found.rank == 21  # as from one station
@@ -216,7 +214,6 @@ study = load_script("wrong_rows_study")
 CASES = {case.title(): case for case in study.CASES}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("text", ["position | 40 | 25% | 1–50", "pose | 40 | 25% | 1"])
 def test_wrong_rows_of_few_are_named_and_do_no_harm(text):
     """What is identified is then what the good rows tell, to rounding: their Huber weights are 1 nearly all."""
@@ -235,7 +232,6 @@ def test_wrong_rows_over_many_draws(case):
     assert sum(good for *_, good in found) <= 1  # 4.03 σ of 1200 rows: of honest ones 1 in 10⁹ has half weight
 
 
-@pytest.mark.slow
 def test_without_the_search_wrong_rows_would_do_harm():
     """The test above can fail: Huber's weights alone follow ten wrong rows of forty."""
     _, data, _ = study.simulated(CASES["position | 40 | 25% | 1–50"], 0)

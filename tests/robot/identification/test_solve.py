@@ -21,6 +21,8 @@ from tests.levels import sampled
 from tests.scripts import load_script
 from tests.support.arms import MARKERS, two_arms
 
+pytestmark = pytest.mark.slow
+
 QUICK = IdentifyOptions(folds=0)
 
 
@@ -33,7 +35,6 @@ def simulated(seed: int, count: int, sigma_mm: float = 0.05, sigma_rad: float = 
     return true, measured(true, joint_vectors(true, count, rng), rng, sigma_mm, sigma_rad, names)
 
 
-@pytest.mark.slow
 def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
     """Forty places, four measurements at each with one error of 0.2 mm in common; taken for independent, the mean
     squared error of new positions over the covariance is 5.3. Two draws: 1 ± 0.32, three of these."""
@@ -53,7 +54,6 @@ def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
     assert 0.05 < np.mean(squares) < 1.95
 
 
-@pytest.mark.slow
 def test_without_noise_the_arm_is_found_exactly():
     true, data = simulated(1, 40, 0, 0)
     found = identify(mh80(), data, QUICK)
@@ -81,7 +81,6 @@ def test_derivatives_are_those_of_differences(kind, tree):
         )
 
 
-@pytest.mark.slow
 def test_held_out_error_is_that_of_new_poses():
     true, data = simulated(5, 60)
     found = identify(mh80(), data, IdentifyOptions(repeats=1))
@@ -128,7 +127,6 @@ def test_the_covariance_is_true(count):
     assert np.mean(rows) == pytest.approx(1, abs=3 * np.sqrt(2 / 9 / draws))
 
 
-@pytest.mark.slow
 def test_a_flat_direction_is_no_failure():
     """Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times."""
     study = load_script("identify_study")
@@ -138,7 +136,6 @@ def test_a_flat_direction_is_no_failure():
     assert 0.3 < parameters < 2.2  # of 21 squares
 
 
-@pytest.mark.slow
 def test_an_outlier_is_named_and_does_no_harm():
     _, data = simulated(6, 50)
     positions = data.positions.copy()
@@ -183,7 +180,6 @@ def test_data_that_cannot_be_right_are_named(spoil, kind, words):
         identify(mh80(), spoil(data), QUICK)
 
 
-@pytest.mark.slow
 def test_an_arm_whose_rows_are_singular_is_identified():
     rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
     arm = Robot("singular", "standard", rows, (Joint(),) * 6)
@@ -200,7 +196,6 @@ def test_an_arm_whose_rows_are_singular_is_identified():
     assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
-@pytest.mark.slow
 def test_rokae_held_out(rokae):
     robot, data = rokae
     assert len(data) == 30

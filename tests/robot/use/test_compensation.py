@@ -23,6 +23,8 @@ from tests.levels import sampled
 from tests.outcome import refuses
 from tests.support.arms import elastic, scara, targets
 
+pytestmark = pytest.mark.slow
+
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 FEW = 3
 
@@ -59,7 +61,6 @@ def case(tmp_path):
     return Case(tmp_path)
 
 
-@pytest.mark.slow
 def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
     result = compensate(case.real, targets(None, case.q), case.nominal)
     reached = forward(case.real, result.found.q)
@@ -81,7 +82,6 @@ def test_poses_alone_need_no_nominal_robot(case):
     np.testing.assert_allclose(forward(case.real, result.found.q).translation, case.poses.translation[:FEW], atol=1e-8)
 
 
-@pytest.mark.slow
 def test_joint_values_beside_poses_choose_the_branch(case):
     flipped = case.q + np.array([0, 0, 0, np.pi, 0, np.pi])
     flipped[:, 4] *= -1
@@ -93,7 +93,6 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     assert np.abs(found.q - flipped)[inside].max() < 0.1
 
 
-@pytest.mark.slow
 def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
     given, bare = targets(None, case.q[:FEW]), replace(case.nominal, tools={"": Rigid()})
     found = compensate(case.real, given, bare)
@@ -105,7 +104,6 @@ def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
     assert "is not in the nominal file: that of the identified file is taken in both" in nameless
 
 
-@pytest.mark.slow
 def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
     """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
     bare = replace(case.nominal, tools={"": Rigid()})
@@ -139,7 +137,6 @@ def test_every_tool_by_its_name(case):
     refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.read, ["target", *JOINTS], rows)
 
 
-@pytest.mark.slow
 def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     places = case.poses.translation[:FEW].copy()
     places[1] = [5000, 0, 0]
@@ -191,7 +188,6 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
     assert all(re.search(r"\(J4 at -150\.\d+°, limit -150°\)", note) for note in told)
 
 
-@pytest.mark.slow
 def test_a_long_way_near_a_singularity_is_told(case):
     """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
@@ -212,7 +208,6 @@ def test_bad_targets_are_named(case):
         refuses(message, read_targets, path, case.real, payload_kg=option)
 
 
-@pytest.mark.slow
 def test_each_row_is_compensated_for_its_payload(case):
     bent = elastic(case.real, np.random.default_rng(4))
     mass, poses = np.tile([0.0, 80.0], 2), case.poses[:4]

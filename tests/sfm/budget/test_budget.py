@@ -33,6 +33,8 @@ from stcal.sfm.runs.transaction import MarkerFile, verify
 from tests.outcome import INPUT, assert_error, refuses
 from tests.shared import own_copy, unsealed_copy
 
+pytestmark = pytest.mark.slow
+
 STATEMENT = """
 [fields]
 operator = "A. Smith"
@@ -62,7 +64,6 @@ def stated(saved, tmp_path):
     return statement_of(saved.board_design.stated, path, {"date": "2026-03-01"})
 
 
-@pytest.mark.slow
 def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
     """The run is read from files, so to their digits and the adjustment's last step."""
     assert {row.measurand.name for row in plain.of_kind("position")} == {"2", "4", "5"}

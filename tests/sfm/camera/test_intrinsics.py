@@ -28,6 +28,8 @@ from stcal.sfm.detect.candidates import BoardSighting, ImageDetection
 from stcal.workflows.board_views import corner_grid
 from tests.outcome import fails_with
 
+pytestmark = pytest.mark.slow
+
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 BOARD = reference_board()
 RAYS = np.array([[x, y, 1.0] for x in (-0.35, 0.0, 0.35) for y in (-0.25, 0.0, 0.25)])
@@ -91,7 +93,6 @@ def test_truth_within_predicted_sigma(field_px, count, low, high):
         assert 0.05 < result.sigma()[0] < 0.2
 
 
-@pytest.mark.slow
 def test_sigma_follows_what_the_centres_do():
     # Centres five times as bad as they say: found out, and σ grow as much.
     views = views_of(np.random.default_rng(5), noise_px=0.1)
@@ -130,7 +131,6 @@ def test_rational_model_knows_projections_though_not_its_coefficients():
     assert 0.001 < moved < 0.5
 
 
-@pytest.mark.slow
 def test_intrinsics_that_are_held_stay_and_the_poses_follow():
     wrong = replace(TRUE, focal=[2795.0, 2784.0])
     views = views_of(np.random.default_rng(8), count=6)
@@ -158,7 +158,6 @@ def test_closed_form_finds_the_focal_length_and_where_it_gives_none_several_are_
 BENT = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shown", "model", "refusal"),
     [
@@ -172,7 +171,6 @@ def test_boards_of_one_direction_and_a_model_that_does_not_fit_are_refused(shown
         require_determined(calibrated(views, model), views, BOARD)
 
 
-@pytest.mark.slow
 def test_sigma_cover_a_changed_focus():
     """Half of the views with another focal length: no error of any pixel, and σ cover both."""
     rng = np.random.default_rng(3)
@@ -197,7 +195,6 @@ def with_a_field(views, rng, sigma_px: float, length_px: float = 250.0):
     return moved
 
 
-@pytest.mark.slow
 def test_a_loud_photograph_hardly_counts():
     """It moves the answer by 2.5 σ where it counts; else by 0.3 to 0.6 σ, and σ by −7 to +26 %, in four draws."""
     rng = np.random.default_rng(3)
@@ -212,7 +209,6 @@ def test_a_loud_photograph_hardly_counts():
 STRETCHED = {"along": [[1.0, 0.0], [0.0, 0.0]], "across": [[0.0, 0.0], [0.0, 1.0]], "sheared": [[0.0, 0.5], [0.5, 0.0]]}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("board", "count", "most"),
     [(BOARD, 12, 3.5), (corner_grid(CharucoDesign(9, 7, 26.0, 18.0, "DICT_5X5_100")), 4, 6.0)],
@@ -261,7 +257,6 @@ def test_a_board_upside_down_is_numbered_like_the_others():
     assert all(agree) or not any(agree)  # which way up is by convention
 
 
-@pytest.mark.slow
 def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small_set, small_dataset, tmp_path):
     """The camera file is a prior that covers the truth, and the figures beside it say the same."""
     own, out = small_set("12", "14", detected=False), tmp_path / "camera.txt"
@@ -306,7 +301,6 @@ def test_an_unknown_model_and_images_without_a_board_are_refused(stcal_sfm, smal
     assert not (tmp_path / "c.txt").exists()
 
 
-@pytest.mark.slow
 def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     own = small_set("12", detected=False)
     own.image(3).unlink()

@@ -30,6 +30,8 @@ from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
+pytestmark = pytest.mark.slow
+
 NOISE_PX = 0.005
 JOINT = {"agreement", "halves", "groups", "loops"}
 
@@ -111,7 +113,6 @@ def test_an_honest_run_passes(full_scene, lab):
     assert 20 < max(m.value for m in control if m.unit == "µm") < 300  # tens of µm, at residuals of a hundredth of a px
 
 
-@pytest.mark.slow
 def test_the_joint_result_is_checked_by_its_parts(labels_only, lab, monkeypatch):
     """A loop of three groups: halves, groups left out and ways around the loop agree.
 
@@ -250,7 +251,6 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
     assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
 
 
-@pytest.mark.slow
 def test_a_noisy_image_has_not_moved(full_scene, lab):
     """Its target lies off its board by twenty times σ, as all of its centres do."""
     for seed in range(2):
@@ -306,7 +306,6 @@ def test_a_culprit_is_named_only_where_no_other_would_do():
     assert search(2, lambda out: 1 in out).culprits == ()  # of two either may be it
 
 
-@pytest.mark.slow
 def test_an_adjustment_that_has_not_settled_is_flagged(lab, monkeypatch):
     """One step comes within a hundredth of a pixel of the minimum, which is not at it."""
     scene = make_scene(SceneOptions(seed=3, images_per_group=3, groups=(("1", "2"), ("1", "4"))))
@@ -337,7 +336,6 @@ def test_a_run_of_photographs_passes(small_run):
     assert "not possible" in checks_section(checks)[0]
 
 
-@pytest.mark.slow
 def test_verdicts_are_tests_of_significance():
     """Chance alone: as many suspicious as are promised, and fewer failures."""
     rng = np.random.default_rng(0)
@@ -365,7 +363,6 @@ def test_what_larger_sigma_cover_enlarges_them(ratio, verdict, enlarges):
     assert judge("groups", "t", [trial], "faces", "do").verdict == ("failed" if ratio > 1 else "passed")
 
 
-@pytest.mark.slow
 def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
     """With pixels: one image out of focus."""
     own = small_set("12", "14")
@@ -455,7 +452,6 @@ def test_one_circle_is_suspected_by_how_often_it_is_uneven(group, views, verdict
     assert check.names == ((own,) if verdict == "suspicious" else ())
 
 
-@pytest.mark.slow
 def test_chance_alone_is_suspected_as_rarely_as_promised(group):
     """One verdict in a thousand; of 150 three would be chance once in 2000 (Poisson, 0.15)."""
     rng = np.random.default_rng(1)

@@ -43,6 +43,8 @@ from stcal.synthetic.designs import second_design, tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.outcome import fails_with
 
+pytestmark = pytest.mark.slow
+
 NOISE = CentreNoise(0.1, 3.0)  # of centres: about 0.013 px, so that image and a board of 20 µm matter alike
 SLOW = pytest.mark.slow
 CHANCE = 1e-4  # of a sound forecast to fall outside the bounds of a χ² test, on either side
@@ -215,7 +217,6 @@ def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, commo
             assert positions(view.model) == pytest.approx(after(known, [view], now).position_sigma_mm(), rel=1e-6)
 
 
-@pytest.mark.slow
 def test_advised_views_do_what_is_said(known, advice):
     """Photographed in simulation: errors as forecast, and σ falls from the run to the adjustment as forecast."""
     models = {model.group: model for model in known.models}
@@ -247,7 +248,6 @@ def offered(known):
     return [(model, handed_over(candidates(*handed_over((known, model))))) for model in known.models]
 
 
-@pytest.mark.slow
 def test_an_advised_view_beats_a_random_one(known, advice, coarse):
     views = [view for _, own in offered(known) for view in own]
     random = [after(known, [view], advice.now).worst()[1] for view in views[::2]]
@@ -256,7 +256,6 @@ def test_an_advised_view_beats_a_random_one(known, advice, coarse):
     assert (now - best) > 1.5 * (now - np.mean(random)) > 0
 
 
-@pytest.mark.slow
 def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     found = advise(replace(known, setup=setup_of(known.scene, 0.2)), 1)
     assert found.board_dominates
@@ -265,7 +264,6 @@ def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     assert found.choices[0].sigma_mm > 0.9 * found.now.worst()[1]
 
 
-@pytest.mark.slow
 def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     """Faces 2 and 5 meet in no group; the forecast of a third group is what a scene with that group has."""
     pairs = (("1", "2"), ("1", "5"), ("2", "5"))
@@ -345,7 +343,6 @@ def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(small_run):
     assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
 
 
-@pytest.mark.slow
 def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):
     """By differences of the squared blur between two points of a circle's plane, a hundredth of a px apart in the
     image."""

@@ -20,6 +20,8 @@ from stcal.sfm.detect import detect_files as files
 from stcal.synthetic.scene import image_circles
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
 
+pytestmark = pytest.mark.slow
+
 CHAIN = ("--solve", "chain")
 """For what is seen before faces are adjusted together, which takes half of a small run's time."""
 RESULTS = ("faces.json", "report.json", "report.html", "colmap")
@@ -297,7 +299,6 @@ def test_a_camera_of_opencv_without_a_size_and_two_targets_in_view(small_set, sm
     assert labels["found"] >= 0.97 * labels["visible"]  # the copy may cover some
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     small = small_set("14")
