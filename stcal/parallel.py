@@ -189,8 +189,13 @@ def kept_processes(workers: int | None = None) -> Iterator[None]:
         yield
 
 
+def _cores() -> int:
+    """Returns the number of cores that this process may use, of which a container or a queue may give it some alone."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _number_of_processes(workers: int | None) -> int:
-    wanted = workers or os.cpu_count() or 1
+    wanted = workers or _cores()
     if wanted > 1 and multiprocessing.current_process().daemon:
         note = "a process of multiprocessing.Pool may start no others: one process works, more slowly"
         warnings.warn(note, InputNote, stacklevel=2)
@@ -200,7 +205,7 @@ def _number_of_processes(workers: int | None) -> int:
 
 def load_ahead(workers: int | None = None) -> None:
     """Starts the server of processes, which loads their libraries while this process goes on."""
-    if (workers or os.cpu_count() or 1) > 1:
+    if (workers or _cores()) > 1:
         with _starting():
             _context()
 
