@@ -52,8 +52,8 @@ typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls h
 
 
 def pytest_configure(config):
-    """Fewer examples of each property but in `scripts/full`; a core for each process of tests, which starts no others to
-    share it with unless it says how many; and programs that tests start keep what they compile.
+    """Fewer examples of each property but in `scripts/full`; a core for each process of tests, which starts no others
+    to share it with unless it says how many; and programs that tests start keep what they compile.
 
     Where Python is told to keep nothing, each would compile its libraries anew, which takes longer than most calls.
     """
