@@ -14,7 +14,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the backg
 import multiprocessing.util
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -53,18 +52,12 @@ typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls h
 
 
 def pytest_configure(config):
-    """Fewer examples of each property but in `scripts/full`; a core for each process of tests, which starts no others
-    to share it with unless it says how many; and programs that tests start keep what they compile.
+    """Fewer examples of each property but in `scripts/full`; and programs that tests start keep what they compile.
 
     Where Python is told to keep nothing, each would compile its libraries anew, which takes longer than most calls.
     """
     if "not full" in config.option.markexpr:
         settings.load_profile("quick")
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
-    if worker and hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        with suppress(OSError):  # where a sandbox does not allow it
-            os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
     if os.environ.pop("PYTHONDONTWRITEBYTECODE", "") and "PYTHONPYCACHEPREFIX" not in os.environ:
         kept = tempfile.TemporaryDirectory(prefix="stcal-tests-", ignore_cleanup_errors=True)
         os.environ["PYTHONPYCACHEPREFIX"] = kept.name
