@@ -154,6 +154,16 @@ class Drawing:
             self.words((right + 4, y), text, SMALL - 1, "start")
         self.words(((left + right) / 2, top - 8), title)
 
+    def picture(self, box: Box, rgba: np.ndarray) -> None:
+        """Draws an image (rows, columns, 4), 8 bit, into a box."""
+        stream = io.BytesIO()
+        Image.fromarray(rgba).save(stream, "PNG")
+        left, top, right, bottom = box
+        self._parts.append(
+            f'<image x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{bottom - top:.1f}" '
+            f'preserveAspectRatio="none" href="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"/>'
+        )
+
     def svg(self) -> str:
         """Returns the text of the drawing; equal drawings give equal text."""
         return (
@@ -245,12 +255,7 @@ class Axes:
             share = np.minimum(np.floor(share * bands), bands - 1) / max(bands - 1, 1)
         rgba = np.dstack([mixed(share, ramp), np.where(known, 255, 0)]).astype(np.uint8)
         (x0, y0), (x1, y1) = self.at(extent[::2], extent[1::2])
-        stream = io.BytesIO()
-        Image.fromarray(rgba if y0 < y1 else rgba[::-1]).save(stream, "PNG")
-        self.drawing._parts.append(
-            f'<image x="{x0:.1f}" y="{min(y0, y1):.1f}" width="{x1 - x0:.1f}" height="{abs(y1 - y0):.1f}" '
-            f'preserveAspectRatio="none" href="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"/>'
-        )
+        self.drawing.picture((x0, min(y0, y1), x1, max(y0, y1)), rgba if y0 < y1 else rgba[::-1])
 
     def frame(
         self,
