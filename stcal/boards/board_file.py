@@ -22,7 +22,7 @@ from stcal.boards.board_designs import (
     mean_sides,
     require_tags,
 )
-from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
+from stcal.boards.dictionaries import count_of, known_dictionary
 from stcal.boards.foreign import KEYS as BUNDLE_KEYS
 from stcal.boards.foreign import Count, Few, Squares, kalibr_board_of, tags_of_bundle, yaml_content
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, Polarity, StatedSize, board_lengths, reference_board
@@ -153,7 +153,7 @@ KEYS: dict[str, Any] = {
     "spacing": Annotated[float, Field(gt=0, le=10, strict=True)],
     "border_bits": Bits,
     "first_id": Index,
-    "dictionary": Annotated[str, AfterValidator(of_opencv)],
+    "dictionary": Dictionary,
     **dict.fromkeys(("legacy", "upright"), bool),
     "polarity": Polarity,
     "rings": Rings,

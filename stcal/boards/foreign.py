@@ -11,7 +11,7 @@ import yaml
 from pydantic import AfterValidator, ConfigDict, Field
 
 from stcal.boards.board_designs import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign, FlatBoard
-from stcal.boards.dictionaries import count_of, is_of_apriltag
+from stcal.boards.dictionaries import count_of
 from stcal.errors import InputError
 from stcal.io.rotations import of_quaternions
 from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
@@ -29,7 +29,7 @@ FLAT_MM, FLAT_RAD = 0.01, 1e-3
 CORNERS = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
 """Corners of a tag of side 1 (X right, Y up), in the order of OpenCV, which draws this family half a turn round."""
 UPRIGHT = np.roll(CORNERS, 2, axis=0)
-"""The same of a tag that stands as OpenCV draws it, and of families that OpenCV lacks."""
+"""The same of a tag that stands as OpenCV draws it."""
 
 
 class _Tag(Strict):
@@ -90,7 +90,7 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
             fault = f"{place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle"
             remedy = "none allowed: targets are flat here; give the tags of one plane"
             raise InputError("E-LAYOUT-FLAT", f"{where}: {fault}, {remedy}")
-    corners_of_one = UPRIGHT if data.upright or is_of_apriltag(data.tag_family) else CORNERS
+    corners_of_one = UPRIGHT if data.upright else CORNERS
     tags = []
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):
         corners = METRE_MM * tag.size * corners_of_one @ rotation[:2, :2].T + middle[:2]

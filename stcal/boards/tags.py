@@ -1,4 +1,4 @@
-"""Detection of tags (through ``cv2.aruco``; families that it lacks through ``pupil_apriltags``)."""
+"""Detection of tags, through ``cv2.aruco``."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.board_designs import AprilGridDesign, BoardView, TagLayout, mean_sides, view_of
-from stcal.boards.dictionaries import FAMILIES, cells_of, dictionary_of, find_family
+from stcal.boards.dictionaries import cells_of, dictionary_of
 from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
@@ -72,10 +72,6 @@ def find_tags(
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
-        if name in FAMILIES:
-            for tag, place in find_family(grey, name):
-                places_of.setdefault((name, tag), []).append(place.astype(np.float32))
-            continue
         settings = [detector_settings(name, border_bits, windows) for windows in windows_px]
         detectors = [cv2.aruco.ArucoDetector(dictionary_of(name), each) for each in settings]
         for large, larger, grown_px in _looks(grey, joined):
@@ -97,11 +93,10 @@ def find_tags(
         places_of[tag] = [p for p, area in sized if not any(area < large and _inside(p, o) for o, large in every)]
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
     cells = np.array([cells_of(name, border_bits) for name, _ in once])
-    white = np.array([name in FAMILIES for name, _ in once], bool)
     corners = np.array(list(once.values()), float).reshape(-1, 4, 2)
     for _ in range(1 + joined):  # places from larger and dilated images are less accurate
-        corners, covariance, smear_px = _refined(grey, corners, cells, white)
-    saturated = _saturated(grey, corners, np.where(white, -cells, cells))
+        corners, covariance, smear_px = _refined(grey, corners, cells)
+    saturated = _saturated(grey, corners, cells)
     # If the white is partly saturated, each edge shifts by a different amount.
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
     joint = covariance + uneven[:, None, None] * np.eye(8)
@@ -181,7 +176,7 @@ def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ..
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the saturated share (n,) of the white half a cell outside of tags; inside for negative ``cells``."""
+    """Return the saturated share (n,) of the white half a cell outside of tags."""
     middle = corners.mean(1, keepdims=True)
     outer = middle + (corners - middle) * (1 + 1 / cells)[:, None, None]
     along = np.linspace(0, 1, SATURATION_POINTS, endpoint=False)[:, None]
@@ -191,16 +186,8 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
     return (level.reshape(len(corners), 4 * SATURATION_POINTS) >= SATURATED).mean(1)
 
 
-def _refined(
-    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return corners and covariances, refined where all edges are seen, and motion; ``white`` : (n,) white inside."""
-    if white.any():
-        refined, covariance, smears = np.array(corners), np.zeros((len(corners), 8, 8)), [0.0, 0.0]
-        for i, (colour, picture) in enumerate(((~white, grey), (white, 255 - grey))):
-            own = np.zeros(int(colour.sum()), bool)
-            refined[colour], covariance[colour], smears[i] = _refined(picture, corners[colour], cells[colour], own)
-        return refined, covariance, max(smears)
+def _refined(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return corners and covariances, refined where all edges are seen, and motion."""
     measured, joint, seen, smear_px = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
     away = np.linalg.norm(np.where(seen[:, None, None], measured - corners, 0), axis=2).max(1, initial=0)

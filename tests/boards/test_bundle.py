@@ -98,3 +98,6 @@ def test_names_of_families():
     names = {"tag36h11": "36h11", "Tag16h5": "16h5", "t25h9": "25h9", "tag36h10": "36h10", "apriltag_36h11": "36h11"}
     assert {name: known_dictionary(name) for name in names} == {n: f"DICT_APRILTAG_{own}" for n, own in names.items()}
     assert known_dictionary("DICT_6X6_250") == "DICT_6X6_250"
+    for name in ("tagStandard41h12", "TAGCIRCLE21H7", "tag_custom_48h12", "tag52h13", "tagStandard36h11"):
+        with pytest.raises(ValueError, match=r"OpenCV does not detect this family .* tag36h11"):
+            known_dictionary(name)
