@@ -1,15 +1,10 @@
-"""Lines between the cells of tags, by the areas in each pixel: their scatter shows how far sampling displaces edges."""
+"""Edges by the areas in each pixel, and how far the pixels' sampling displaces them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import ndtr
-
-from stcal.boards.board_designs import UNIT_SQUARE
-from stcal.geometry.plane import apply_homography, fit_homographies
 
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel about its centre, px²
 PRIOR_PX = 0.005  # σ of the displacement of edges by the pixels' sampling before an image is seen, px
@@ -17,7 +12,7 @@ POINTS_PX = 0.01
 """The same of images that were resampled in points, as far as nothing shows that they were not, px."""
 LEAST_PX = 0.0005  # least σ of a displacement that is told apart from another, px
 ROUNDS = 5  # number of times that estimates are weighted by the variances found before
-BY_CHANCE = 3.0  # number of σ up to which scatter of lines is taken for chance
+HARMONICS = 2.0  # estimates in that of an edge: the cosine and the sine of the phase
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -92,11 +87,10 @@ def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
-    """What lines say about the variance of the displacement of edges by sampling, px²; k estimates."""
+    """What k turned edges say about the variance of their displacement by sampling, px²."""
 
     square: np.ndarray  # the variance, which may be negative
     noise: np.ndarray  # mean of its part by other errors
-    lines: np.ndarray  # equivalent number of lines
     passed: np.ndarray  # as of :func:`passed_by_blur`
 
 
@@ -112,199 +106,16 @@ class SamplingVariance:
         return self.of_area * passed**2 + self.of_points
 
 
-def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[Displacement] = ()) -> SamplingVariance:
-    """Return the variances that explain the estimates best, weighted by their certainty; at least 0. Both have a prior.
-    ``otherwise`` is the scatter of lines that does not follow the phase; it counts if it is beyond chance."""
-    square, noise, lines, passed = _known(by_phase)
+def displacement_variance(told: Displacement) -> SamplingVariance:
+    """Return the variances that explain the estimates best, weighted by their certainty; at least 0. Both have a
+    prior."""
+    known = np.isfinite(told.square)
+    square, noise, passed = told.square[known], told.noise[known], told.passed[known]
     design = np.stack([passed**2, np.ones_like(passed)], axis=-1)
     before = np.array([PRIOR_PX, POINTS_PX]) ** 2
     variance = before
     for _ in range(ROUNDS):
-        root = np.sqrt(lines) / (noise + design @ variance + LEAST_PX**2)  # of weights: squares vary as themselves
+        root = np.sqrt(HARMONICS) / (noise + design @ variance + LEAST_PX**2)  # squares vary as themselves
         rows = np.concatenate([root[:, None] * design, np.diag(1 / before)])
         variance = nnls(rows, np.concatenate([root * square, np.ones(2)]))[0]
-    square, noise, lines, _ = _known(otherwise)
-    certainty = lines * (noise + PRIOR_PX**2) ** -2
-    scatter, chance = (certainty * square).sum(), np.sqrt((certainty**2 * 2 * noise**2 / lines).sum())
-    further = scatter / certainty.sum() if scatter > BY_CHANCE * chance else 0.0
-    return SamplingVariance(float(variance[0]), float(variance[1] + further))
-
-
-def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
-    names = [part.name for part in fields(Displacement)]
-    every = [np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names]
-    known = np.isfinite(every[0]) & (every[2] > 0)
-    return [values[known] for values in every]
-
-
-CLEAR_BLURS = 2.5  # distance from other lines, in σ of blur and pixel, from which on pixels are used
-END_BLURS = 2.0  # distance from the ends of a cell's side, in the same, from which on pixels are used
-LEAST_BLURS, MOST_BLURS = 1.5, 4.0
-"""Least and largest reach of pixels to either side of a line, in σ of blur and pixel."""
-FARTHEST_PX = 0.1
-"""Largest distance of a line from the tag's grid; cells that are printed in dots are not all of one size."""
-MOST_PX = 0.04
-"""Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
-STEPS = 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OuterLines:
-    """What was measured of the outer edges of n tags, from each corner to the next."""
-
-    corners_px: np.ndarray  # (n, 4, 2)
-    blur: np.ndarray  # (n,) variance, px²
-    dark: np.ndarray  # (n,) grey values, as ``rise``
-    rise: np.ndarray
-    noise: np.ndarray  # (n,) variance of pixels
-    variance: np.ndarray  # (n, 4) of the edges' offsets
-    by_sampling: np.ndarray  # (n, 4, 2) their derivatives by the harmonics of sampling
-
-
-def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
-    """Return the displacement of edges by sampling, estimated from the lines between cells, which are evenly spaced
-    apart from perspective and lens: what is left of them and follows the phase of the pixels. And that by other errors,
-    such as the print: the rest of their scatter."""
-    square = np.broadcast_to(cells * (UNIT_SQUARE + 0.5), outer.corners_px.shape)
-    image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
-    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
-    xy = apply_homography(image_from_grid, middle).astype(np.float32)
-    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
-    bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-    return _scatter(cells, *_offsets(grey, _Pieces(image_from_grid, bright, cells), outer, cells))
-
-
-class _Pieces:
-    """The s sides between a dark and a bright cell in the grids of tags."""
-
-    def __init__(self, image_from_grid: np.ndarray, bright: np.ndarray, cells: int):
-        found = []
-        for axis, colour in enumerate((np.swapaxes(bright, 1, 2), bright)):  # (n, line, along); 0: lines of one x
-            change = colour[:, 1:].astype(int) - colour[:, :-1]
-            tag, line, along = np.nonzero(change)
-            found.append((tag, np.full(len(tag), axis), line + 1, along, change[change != 0].astype(float)))
-        self.tag, self.axis, self.line, place, self.sign = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        self.along = (2 * place + 1) / cells - 1  # place on the line, -1 to 1
-        step, across = np.eye(2)[1 - self.axis], np.eye(2)[self.axis]
-        corner = self.line[:, None] * across + place[:, None] * step
-        self.start, self.end, before, after = (  # (s, 2) px
-            apply_homography(image_from_grid[self.tag], (corner + move)[:, None])[:, 0]
-            for move in (0 * step, step, -across, across)
-        )
-        direction = (self.end - self.start) / np.linalg.norm(self.end - self.start, axis=1, keepdims=True)
-        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
-        # (s, 2) towards the next cell, whose side is ``sign`` +1 where it is bright
-        self.normal = normal * np.sign(((after - before) * normal).sum(1))[:, None]
-        # How far the cell's other sides run along the line for each px across it.
-        self.lean = ((after - before) * direction).sum(1) / ((after - before) * self.normal).sum(1)
-        widths = [np.abs(((there - self.start) * self.normal).sum(1)) for there in (before, after)]
-        self.cell = np.minimum(*widths)  # distance to the next line, px
-
-
-def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> tuple[np.ndarray, ...]:
-    """Return the offsets of the lines between cells, and of the outer edges, from the grid, px, NaN where a line is not
-    seen; their variances, derivatives by sampling and mean places of the sides used, (2n, k) by tag and direction, k
-    lines of both signs apart; and what the blur passes, (2n,)."""
-    n = len(outer.blur)
-    shape = (n, 2, cells + 1, 2)
-    group = np.ravel_multi_index((pieces.tag, pieces.axis, pieces.line, (pieces.sign > 0).astype(int)), shape)
-    level, distance, used, rise = _pixels(grey, pieces, np.sqrt(outer.blur + PIXEL_VARIANCE))
-    blur, sign = outer.blur[pieces.tag], pieces.sign[:, None, None]
-    value = np.zeros((n * 4 * (cells + 1), 3))  # shift, dark, rise
-    value[:, 1], value[:, 2] = (np.repeat(part, 4 * (cells + 1)) for part in (outer.dark, outer.rise))
-    inverse, pull = np.zeros((len(value), 3, 3)), np.zeros((len(value), 3, 2))
-    for _ in range(STEPS):
-        own = value[group][:, :, None, None]
-        away = distance - own[:, 0]
-        step, slope = integrated_step(sign * away, pieces.normal, blur)[:2]
-        design = np.stack([-own[:, 2] * sign * slope, np.ones_like(step), step], axis=-1)
-        residual = level - own[:, 1] - own[:, 2] * step
-        sampling = of_sampling(away, rise, design[..., 0])
-        rows = products(design, used, np.concatenate([design, sampling, residual[..., None]], -1))
-        total = np.zeros((len(value), 3, 6))
-        np.add.at(total, group, rows)
-        seen = total[:, 1, 1] > 0
-        inverse = np.where(seen[:, None, None], np.linalg.inv(total[..., :3] + 1e-9 * np.eye(3)), np.nan)
-        value += (inverse @ total[..., 5:])[..., 0]
-        pull = inverse @ total[..., 3:5]
-    offset = value[:, 0].reshape(shape)
-    variance = inverse[:, 0, 0].reshape(shape) * outer.noise[:, None, None, None]
-    by_sampling = pull[:, 0].reshape(*shape, 2)
-    offset[~(np.abs(offset) < FARTHEST_PX)] = np.nan
-    for edge, axis, line, sign in ((0, 1, 0, 0), (1, 0, -1, 1), (2, 1, -1, 1), (3, 0, 0, 0)):
-        offset[:, axis, line, sign] = 0.0
-        variance[:, axis, line, sign] = outer.variance[:, edge]
-        by_sampling[:, axis, line, sign] = outer.by_sampling[:, edge] * (-1 if line == 0 else 1)  # outwards there
-    pixels = used.sum((1, 2))
-    along = np.bincount(group, pixels * pieces.along, len(value)) / np.bincount(group, pixels, len(value)).clip(1)
-    direction = 2 * pieces.tag + pieces.axis
-    passed = np.bincount(direction, passed_by_blur(rise, blur), 2 * n) / np.bincount(direction, minlength=2 * n).clip(1)
-    flat = 2 * n, 2 * (cells + 1)
-    return offset.reshape(flat), variance.reshape(flat), by_sampling.reshape(*flat, 2), along.reshape(flat), passed
-
-
-def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return level, distance from the line and use (s, p, a) of pixels, and the distance's rise (s,) by pixel."""
-    each, sigma = np.arange(len(pieces.tag)), sigma[pieces.tag]
-    along = pieces.end - pieces.start
-    length = np.linalg.norm(along, axis=1)
-    major = np.abs(along).argmax(1)
-    direction = along / np.maximum(length, 1e-9)[:, None]
-    ends = np.sort(np.stack([pieces.start[each, major], pieces.end[each, major]]), axis=0)
-    first, last = np.ceil(ends[0]), np.floor(ends[1])
-    reach = np.minimum(pieces.cell - CLEAR_BLURS * sigma, MOST_BLURS * sigma)
-    most = int(max(np.max(last - first, initial=0.0), 0.0)) + 1
-    half = reach_of(reach, pieces.normal[each, 1 - major])
-    column = first[:, None] + np.arange(most)
-    slope = along[each, 1 - major] / along[each, major]
-    middle = np.rint(pieces.start[each, 1 - major, None] + slope[:, None] * (column - pieces.start[each, major, None]))
-    level, xy, inside = across_edges(grey, major, column, middle, half)
-    off = xy - pieces.start[:, None, None]
-    place, distance = (np.einsum("spai,si->spa", off, axis) for axis in (direction, pieces.normal))
-    place = place - pieces.lean[:, None, None] * distance
-    used = (np.abs(distance) <= reach[:, None, None]) & (column <= last[:, None])[..., None]
-    used &= np.abs(place - length[:, None, None] / 2) <= (length / 2 - END_BLURS * sigma)[:, None, None]
-    used &= (reach > LEAST_BLURS * sigma)[:, None, None] & inside
-    return level, distance, used.astype(float), pieces.normal[each, 1 - major]
-
-
-def _scatter(cells: int, offset, variance, by_sampling, along, passed) -> tuple[Displacement, Displacement]:
-    """Return what evenly spaced lines say by tag and direction: how they move with the phase, and scatter otherwise."""
-    place = 2 * np.arange(cells + 1) / cells - 1
-    sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)
-    m, k = offset.shape
-    fixed = np.stack([np.ones(k), place, place**2, sign], axis=-1)  # middle, spacing and its change, spread of black
-    turned = np.stack([along, along * place], axis=-1)  # of the grid, whose corners have errors
-    design = np.concatenate([np.broadcast_to(fixed, (m, *fixed.shape)), turned], axis=-1)
-    pull = np.nan_to_num(by_sampling)
-    there = np.isfinite(offset) & np.isfinite(variance) & (variance > 0)
-    weight = np.where(there, 1 / np.where(there, variance, 1.0), 0.0)
-    root = np.sqrt(weight)
-    offset = np.where(there, offset, 0.0)
-    # Residuals over their σ, and the matrix that makes them of errors.
-    basis = root[..., None] * design
-    made = np.eye(k) - basis @ np.linalg.pinv(basis, rcond=1e-6)
-    made = made * there[:, None, :] * there[:, :, None]
-    left = np.einsum("gij,gj->gi", made, root * offset)
-    freedom = np.einsum("gii->g", made)
-    # Seen from its other side, an edge has the opposite phase and the opposite displacement: a sine of the phase.
-    # If all lines have about one phase, they move together, as another spacing would move them: ``known`` is small.
-    wave = np.sqrt(2) * np.einsum("gij,gj->gi", made, root * pull[..., 1])
-    known = np.maximum((wave**2).sum(1), 1e-12)
-    amplitude = (wave * left).sum(1) / known
-    by_phase = amplitude**2 - 1 / known
-    same = np.equal.outer(np.arange(k) // 2, np.arange(k) // 2)
-    shared = (pull @ np.swapaxes(pull, 1, 2)) * same * root[:, :, None] * root[:, None]
-    by_displacement = np.einsum("gij,gjk,gik->g", made, shared, made)
-    rest = ((left - amplitude[:, None] * wave) ** 2).sum(1)
-    good = (freedom > 1.5) & (by_displacement > 1e-9)
-    by_displacement = np.where(good, by_displacement, 1.0)
-    square = (rest - (freedom - 1)) / by_displacement
-    good &= square < MOST_PX**2 + 3 * np.sqrt(2 * freedom.clip(1)) / by_displacement
-    square[~good] = np.nan
-    others = np.maximum(freedom - 1, 0.0)
-    by_phase[~good] = np.nan
-    return (
-        Displacement(by_phase, 1 / known, np.ones(m), passed),
-        Displacement(square, others / by_displacement, others, passed),
-    )
+    return SamplingVariance(*variance.tolist())

@@ -11,7 +11,6 @@ from stcal.boards.area import (
     PIXEL_VARIANCE,
     PRIOR_PX,
     Displacement,
-    OuterLines,
     SamplingVariance,
     across_edges,
     displacement_variance,
@@ -21,7 +20,6 @@ from stcal.boards.area import (
     products,
     reach_of,
     solved,
-    told_by_lines,
 )
 from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import block_diagonal
@@ -83,27 +81,10 @@ def corners_from_edges(
         rough = _fit(frame.place, offset, good)
         area = _Area(grey, frame, rough)
         meeting = _meet(frame, area.lines(rough, SamplingVariance(0.0, 0.0)))[0]
-        by_lines = _told_by_lines(grey, meeting, np.reshape(cells, -1), area)
-        variance = displacement_variance([area.told, *(each for each, _ in by_lines)], [each for _, each in by_lines])
-        covariance = _meet(frame, area.lines(rough, variance))[1]
+        covariance = _meet(frame, area.lines(rough, displacement_variance(area.told)))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
     return meeting, covariance, seen.all(1), area.smear_px
-
-
-def _told_by_lines(
-    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area"
-) -> list[tuple[Displacement, Displacement]]:
-    told, n = [], len(corners)
-    spread = np.where(area.settled, area.by_noise[:, 0, 0].reshape(n, 4), np.nan)
-    whole = np.isfinite(corners).all((1, 2)) & np.isfinite(spread).all(1)
-    for count in np.unique(cells[whole]).tolist():
-        rows = np.flatnonzero(whole & (cells == count))
-        blur, dark, rise, noise = np.median(area.pixels[rows], axis=1).T
-        sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
-        outer = OuterLines(corners[rows], blur, dark, rise, noise, spread[rows], sampling)
-        told.append(told_by_lines(grey, outer, count))
-    return told
 
 
 def corners_by_edges(corners: np.ndarray) -> np.ndarray:
@@ -250,8 +231,6 @@ class _Area:
         scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
         noise = _noise_of(scatter, distance, weight)
         noise = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
-        # (n, 4, 4) variance of the blur, px², dark, rise, and variance of pixels
-        self.pixels = np.column_stack([value[:, [2, 3, 5]], noise]).reshape(*shape, 4)
         self.passed = passed_by_blur(per_pixel, value[:, 2])  # (m,) share of sampling that the blur passes
         # (m, 2, 2) derivatives of offset and slope by the two harmonics of sampling, in columns
         self.by_sampling = (inverse @ products(design, weight, sampling))[:, :2]
@@ -328,7 +307,7 @@ def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement
     gram = products(harmonic, weight, harmonic)
     by_noise, by_displacement = noise * np.trace(gram, axis1=1, axis2=2), np.maximum((gram**2).sum((1, 2)), 1e-12)
     square = ((pulled**2).sum(1) - by_noise) / by_displacement
-    return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, np.full(len(square), 2.0), passed)
+    return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, passed)
 
 
 def _noise_of(residual, distance, weight) -> np.ndarray:
