@@ -129,7 +129,6 @@ CALLS = (
     Call("sfm export-database", "@run +copy.db --schema 4.2"),
     *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt")),
     *(Call("sfm export", f"@run +box.{suffix} --name box") for suffix in ("urdf", "xacro", "yaml", "yml", "csv")),
-    *(Call("sfm export", f"@run +box.{suffix}") for suffix in ("gltf", "glb")),
     Call("sfm export", "@run +box.txt --form ros2"),
     Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
     Call("sfm faces", "@run/colmap/models --run @run --out +faces.json", 1.0),
