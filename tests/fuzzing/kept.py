@@ -27,7 +27,7 @@ STREAM_KEPT, STREAM_CLOSED = 20_000_000, 30_000_000
 LONGEST_CALL_S = 6.0
 KEPT_IN = ("run", "detected")
 """Folders of the stock that commands keep for the next one."""
-COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".bin", ".gltf", ".glb"}
+COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".bin"}
 REMADE_BY = ("sfm run", "sfm detect")
 """Commands that make what they keep anew; others leave what was spoiled as it is."""
 TOLD = ("not as the run left it", "are not compared")

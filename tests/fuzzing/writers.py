@@ -11,7 +11,7 @@ from stcal.errors import ConvergenceError
 from stcal.io import files
 from tests.commands import Call
 
-TO_LOOK_AT = {".html", ".pdf", ".svg", ".png", ".jpg", ".gltf", ".glb"}
+TO_LOOK_AT = {".html", ".pdf", ".svg", ".png", ".jpg"}
 """Suffixes of pages, drawings and scenes, from which no number is taken."""
 OF_A_RUN = {
     *("report.json", "labels.csv", "detections.csv", "colmap", "inputs"),

@@ -227,9 +227,9 @@ def _warn_of_failures(run: Path) -> None:
 def export_database(
     run: Run,
     out: Annotated[Path, "Write the copy to this file, which must be new.", Arg("OUT.db", writes=True)],
-    schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."],
+    schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.1, 4.2."],
 ) -> None:
-    """Copy the run's database in the form of another version of COLMAP; ids, orders and values stay the same."""
+    """Copy the run's database in the form of COLMAP 3.8, which later versions open; ids and values stay the same."""
     from stcal.sfm.interop.export_colmap import database_text
     from stcal.sfm.interop.export_colmap import export_database as export
 
@@ -256,13 +256,13 @@ def export_run(
     out: Annotated[
         Path,
         "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV), .csv, .gltf or .glb.",
+        "1), .yml (OpenCV) or .csv.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb."] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv or csv."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
-    """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""
+    """Write faces and circles for robots and other programs, with σ if the form can hold them."""
     from stcal.sfm.interop.export import export_run as export
     from stcal.sfm.interop.export import export_text
 

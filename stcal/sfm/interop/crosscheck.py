@@ -28,12 +28,20 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.data.group_model import WorldModel
-from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, write_copy
+from stcal.sfm.interop.export_colmap import FORM, require_version, write_copy
 from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.runs.comparisons import CameraRow, Crosscheck, FaceDifference, MappingCompared, Tolerances, allowed_text
+from stcal.sfm.runs.comparisons import (
+    CameraRow,
+    Crosscheck,
+    FaceDifference,
+    FaceOff,
+    MappingCompared,
+    Tolerances,
+    allowed_text,
+)
 from stcal.sfm.runs.folder import require_report, write_report
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 from stcal.sfm.runs.transaction import AGAIN, added_results
@@ -210,8 +218,6 @@ def calibrate_models(
 
 
 MICRO = 1e3
-MIN_INLIERS = pycolmap.TwoViewGeometryOptions().min_num_inliers
-"""Least number of inliers of an initial pair, with whose default COLMAP estimates it."""
 TOLERANCES = Tolerances()
 FACE_FLOOR = np.array([1e-7] * 3 + [1e-4] * 3)
 """Negligible differences in rad and mm: 6 µdeg and 0.1 µm. Circles that carry the frame have no σ."""
@@ -283,22 +289,17 @@ def _compared(
     run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress
 ) -> Crosscheck:
     native = find_colmap(colmap)
-    schema = schema_of_version(native.version)
+    require_version(native.version)
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
     native_models, own_models, adjusted = [], [], []
     with scratch_folder("crosscheck") as folder:
-        write_copy(run, folder / "native.db", schema)
-        write_copy(run, folder / "ours.db", find_schema("4.2"))
+        write_copy(run, folder / "native.db")
+        shutil.copy(folder / "native.db", folder / "ours.db")
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names, work = [image.name for image in group], folder / f"group{index}"
             chosen = next(row for row in run.report["groups"] if row["name"] == name)["pairs"][0]
-            first, second = (next(i for i in group if i.name == chosen[which]) for which in ("first", "second"))
-            pair, shared = (ids[first.name], ids[second.name]), len(set(first.labels) & set(second.labels))
-            if shared < MIN_INLIERS:  # few tags have few corners
-                fault = f"{first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to begin with"
-                remedy = "COLMAP cannot map it, check the run with the checks of its report"
-                raise MappingError("E-CROSSCHECK-FEW", f"group {name}: {fault}; {remedy}")
+            pair = ids[chosen["first"]], ids[chosen["second"]]
             map_natively(native, folder / "native.db", work, names, mapper_options(native, names, pair), timeout_s)
             path, model = _native_model(work / "models", name, native, run, ids)
             native_models.append(model)
@@ -329,7 +330,7 @@ def _compared(
     check = Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
-        schema=schema.name,
+        schema=FORM,
         tolerances=tolerances if run.faces.target_from_face_covariance else tolerances.without_sigma(),
         notes=list(of_native.notes),
         differences=[],
@@ -383,12 +384,6 @@ def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun
     return read_model(written, run.observations, ids, run.corrected_px)
 
 
-def _off(difference: np.ndarray) -> tuple[float, float]:
-    """Returns the lengths of shift and turn, µm and millidegrees, of a difference (6,), rad and mm."""
-    shift, turn = float(np.linalg.norm(difference[3:])), float(np.degrees(np.linalg.norm(difference[:3])))
-    return MICRO * shift, MICRO * turn
-
-
 def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> MappingCompared:
     """Returns the differences of a target from other faces and circles, also in the run's σ."""
     covariances = run.faces.circle_covariance_mm2
@@ -408,9 +403,8 @@ def face_differences(
     rows: dict[str, FaceDifference | None] = dict.fromkeys(sorted(a.keys() | b.keys()))
     for face in a.keys() & b.keys():
         difference = a[face].difference(b[face])
-        um, mdeg = _off(difference)
         sigmas = _sigmas(difference, covariance[face], FACE_FLOOR) if face in covariance else None
-        rows[face] = FaceDifference(translation_um=um, rotation_mdeg=mdeg, sigmas=sigmas)
+        rows[face] = FaceDifference.of(difference, sigmas=sigmas)
     return rows
 
 
@@ -437,9 +431,10 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
         aligned = theirs.in_world(alignment).camera_from_model
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name in poses:
-                um, mdeg = _off(pose.inverse().difference(poses[name].inverse()))
+                off = FaceOff.of(pose.inverse().difference(poses[name].inverse()))
                 sigmas = _sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6))
-                rows.append(CameraRow(image=name, position_um=um, rotation_mdeg=mdeg, sigmas=sigmas))
+                place = {"position_um": off.translation_um, "rotation_mdeg": off.rotation_mdeg}
+                rows.append(CameraRow(image=name, **place, sigmas=sigmas))
     return sorted(rows, key=lambda row: row.image)
 
 

@@ -1,11 +1,8 @@
-"""Export of a finished run to files of other programs: robots' software, viewers, tables."""
+"""Export of a finished run to files of other programs: robots' software, OpenCV, tables."""
 
-import base64
-import json
 import os
-import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
 from xml.sax.saxutils import quoteattr
@@ -15,28 +12,19 @@ import numpy as np
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
-from stcal.io.json import Part, checked
-from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, metres, ros1_launch, ros2_launch, xyzw
+from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, ros1_launch, ros2_launch, xyzw
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.labels import CircleLabel
 from stcal.report.text import number
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.runs.report_file import ReportCamera, Space
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run, target_in
-from stcal.sfm.runs.transaction import as_written
 
 FACES_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 """Okabe and Ito's palette, which colour-blind people can tell apart, used in a cycle in the order of the faces."""
 BOARD_RGB = (150, 150, 150)
-
-
-class _Report(Part):
-    camera: ReportCamera
-    scene: Space
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +34,6 @@ class Content:
     root: str  # name of the target frame
     run: SavedRun
     target: CalibratedTarget  # of faces.json
-    camera: Camera  # as the run refined it
-    photographs: dict[tuple[str, str], Rigid]  # target_from_camera by name and group of the photograph
 
     def circles_of(self, face: str) -> list[CircleLabel]:
         """Returns the circles of a face, in the order of the design."""
@@ -84,8 +70,7 @@ class Content:
     def said(self) -> list[str]:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
-        parts = {"faces": faces.target_from_face, "circles": faces.circles, "photographs": self.photographs}
-        counts = ", ".join(f"{len(content)} {name}" for name, content in parts.items())
+        counts = f"{len(faces.target_from_face)} faces, {len(faces.circles)} circles"
         frames = f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face"
         lines = [
             f"stcal {stcal.__version__}: target {self.run.target_design.name}, {counts}",
@@ -119,15 +104,7 @@ def content_of(run: SavedRun, root: str) -> Content:
     """Returns the content of a run; ``root``: name of the target frame."""
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
-    camera = run.camera
-    with as_written(run.folder / "report.json"):
-        report = checked(run.report, _Report)
-    if run.options.refine_camera:
-        own = report.camera
-        refined = Camera(camera.width, camera.height, own.focal_px, own.centre_px, own.distortion)
-        camera = Camera.of(refined, camera.colmap_model)
-    views = {(each.image, each.group): Rigid(each.axes.T, each.position_mm) for each in report.scene.cameras}
-    content = Content(root, run, target_in(run.faces), camera, views)
+    content = Content(root, run, target_in(run.faces))
     names = [root, *(each.child for each in content.statics())]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         fault = f"frames: {twice[0]} would be the name of two frames"
@@ -257,182 +234,10 @@ def _escaped(text: str) -> str:
     return text.replace("$(", "$$(").replace("${", "$${")
 
 
-EDGES = 48  # number of edges of a disc. Its triangles leave out 0.3 % of its area.
-CAMERA_SHARE = 0.06  # depth of a camera's pyramid as a share of the scene's extent
-FLOAT, UNSIGNED = 5126, 5125
-VERTICES, INDICES = 34962, 34963
-LINES, TRIANGLES = 1, 4
-NEAR_M = 0.01
-POINTS = 96  # of the ball that shows σ
-Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion x y z w that turns the target's Z to glTF's Y, which points up
-GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
-"""Rotation from OpenCV's to glTF's camera axes. glTF's cameras look along −Z, with Y up."""
-PARTS = ("nodes", "meshes", "materials", "accessors", "bufferViews")
-UNLIT = "KHR_materials_unlit"
-
-
-@dataclass(slots=True, eq=False)
-class _Scene:
-    """Parts of a glTF file by kind, in the order in which they are written, and its buffer."""
-
-    data: bytearray = field(default_factory=bytearray)
-    parts: dict[str, list[dict]] = field(default_factory=lambda: {kind: [] for kind in PARTS})
-
-    def add(self, kind: str, **own) -> int:
-        """Adds a part without its empty lists, and returns its number."""
-        self.parts[kind].append({key: value for key, value in own.items() if value != []})
-        return len(self.parts[kind]) - 1
-
-    def shape(self, points: np.ndarray, indices: np.ndarray) -> dict:
-        """Adds points (n, 3), m, and the indices of lines or triangles between them."""
-        points, indices = points.astype("<f4"), indices.ravel().astype("<u4")
-        numbers, ends = [], {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-        for raw, target, component, kind, more in (
-            (points, VERTICES, FLOAT, "VEC3", ends),
-            (indices, INDICES, UNSIGNED, "SCALAR", {}),
-        ):
-            view = self.add("bufferViews", buffer=0, byteOffset=len(self.data), byteLength=raw.nbytes, target=target)
-            accessor = {"bufferView": view, "componentType": component, "count": len(raw), "type": kind}
-            numbers.append(self.add("accessors", **accessor, **more))
-            self.data += raw.tobytes()
-        return {"attributes": {"POSITION": numbers[0]}, "indices": numbers[1]}
-
-    def mesh(self, name: str, shape: dict, colour: int, mode: int = TRIANGLES) -> int:
-        return self.add("meshes", name=name, primitives=[shape | {"material": colour, "mode": mode}])
-
-
-def gltf(content: Content) -> str:
-    """Returns glTF as JSON with its buffer inside."""
-    tree, data = _tree(content)
-    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode("ascii")
-    return json.dumps(tree | {"buffers": [{"uri": uri, "byteLength": len(data)}]}, ensure_ascii=False, indent=1) + "\n"
-
-
-def glb(content: Content) -> bytes:
-    """Returns glTF as one binary file."""
-    tree, data = _tree(content)
-    text = json.dumps(tree | {"buffers": [{"byteLength": len(data)}]}, ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def _tree(content: Content) -> tuple[dict, bytes]:
-    scene, factor, target, rgb = _Scene(), _exaggeration(content), content.target, colours(content.run)
-    ball, disc = scene.shape(*_ball()), scene.shape(*_disc())
-    below = []
-    for place, (face, pose) in enumerate(target.target_from_face.items()):
-        grey = scene.mesh(f"sigma of face {face}", ball, len(target.target_from_face))
-        own = scene.mesh(f"circles of face {face}", disc, place)
-        circles = []
-        for label in content.circles_of(face):
-            radius_mm, covariance = content.run.faces.radius_mm[label], target.circle_covariance.get(label)
-            children = [scene.add("nodes", name=str(label), mesh=own, scale=[MM_M * radius_mm, MM_M * radius_mm, 1.0])]
-            extras = {"label": str(label), "xyz_mm": target.circles[label].tolist(), "radius_mm": radius_mm}
-            if covariance is not None:
-                ellipsoid = _ellipsoid(covariance, pose, factor)
-                children.append(scene.add("nodes", name=f"sigma of {label}, times {factor:g}", **ellipsoid, mesh=grey))
-                extras["covariance_mm2"] = covariance.tolist()
-            name, at = content.circle_frame(label), (MM_M * content.xyz_face(label)).tolist()
-            circles.append(scene.add("nodes", name=name, translation=at, children=children, extras=extras))
-        extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
-        if face in target.face_covariance:
-            extras["covariance_rad_mm"] = target.face_covariance[face].tolist()
-        placed = {"translation": metres(pose), "rotation": xyzw(pose)}
-        below.append(scene.add("nodes", name=content.face_frame(face), **placed, children=circles, extras=extras))
-    below += _cameras(content, scene) if content.photographs else []
-    extras = {"said": content.said(), "sigma_drawn_times": factor}
-    up = scene.add(
-        "nodes",
-        name="y_up",
-        rotation=Y_UP,
-        children=[scene.add("nodes", name=content.root, children=below, extras=extras)],
-    )
-    for colour in (*(rgb[face] for face in target.target_from_face), (40, 40, 40), BOARD_RGB):
-        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in colour]
-        surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
-        scene.add("materials", pbrMetallicRoughness=surface, doubleSided=True, extensions={UNLIT: {}})
-    tree = {
-        "asset": {"version": "2.0", "generator": content.said()[0]},
-        "extensionsUsed": [UNLIT],
-        "scene": 0,
-        "scenes": [{"nodes": [up]}],
-        **scene.parts,
-        **({"cameras": [_lens(content.camera)]} if content.photographs else {}),
-    }
-    return tree, bytes(scene.data)
-
-
-def _cameras(content: Content, scene: _Scene) -> list[int]:
-    camera, count = content.camera, len(content.target.target_from_face)
-    places = [*content.target.circles.values(), *(pose.translation for pose in content.photographs.values())]
-    right, bottom = camera.width - 0.5, camera.height - 0.5
-    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
-    rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
-    shape = np.vstack([np.zeros(3), CAMERA_SHARE * np.ptp(np.array(places), axis=0).max() * rays])
-    lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
-    frustum = scene.mesh("image at depth", scene.shape(MM_M * shape @ GL_FROM_CV, lines), count + 1, LINES)
-    nodes = []
-    for (name, group), pose in content.photographs.items():
-        turned = xyzw(Rigid(pose.rotation @ GL_FROM_CV, pose.translation))
-        placed = {"translation": metres(pose), "rotation": turned}
-        extras = {"group": group, "target_from_camera_mm": pose.matrix().tolist()}
-        nodes.append(scene.add("nodes", name=name, camera=0, mesh=frustum, **placed, extras=extras))
-    return nodes
-
-
-def _lens(camera: Camera) -> dict:
-    """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
-    across, up = (np.array([camera.width, camera.height]) / camera.focal).tolist()
-    perspective = {"yfov": 2 * float(np.arctan(up / 2)), "aspectRatio": across / up, "znear": NEAR_M}
-    lens = {"focal_px": camera.focal, "centre_px": camera.centre, "distortion": camera.distortion}
-    extras = {"model": camera.colmap_model, "size_px": [camera.width, camera.height]}
-    extras |= {name: values.tolist() for name, values in lens.items()}
-    return {"name": "camera", "type": "perspective", "perspective": perspective, "extras": extras}
-
-
-def _ellipsoid(covariance_mm2: np.ndarray, pose: Rigid, factor: float) -> dict:
-    """Returns how the unit ball becomes the ellipsoid of σ in the face's axes, times ``factor``."""
-    turn = np.array(pose.rotation)
-    values, axes = np.linalg.eigh(turn.T @ covariance_mm2 @ turn)
-    turned = xyzw(Rigid(axes * [np.sign(np.linalg.det(axes)), 1, 1], np.zeros(3)))
-    return {"rotation": turned, "scale": (factor * MM_M * np.sqrt(np.maximum(values, 0))).tolist()}
-
-
-def _disc() -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (EDGES + 1, 3) of the unit disc, the centre first, and triangles, counter-clockwise from +Z."""
-    angle = 2 * np.pi * np.arange(EDGES) / EDGES
-    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
-    around = 1 + np.arange(EDGES)
-    return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
-
-
-def _exaggeration(content: Content) -> float:
-    """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
-    radius_mm = content.run.faces.radius_mm
-    known = [(float(np.sqrt(np.trace(c))), radius_mm[label]) for label, c in content.target.circle_covariance.items()]
-    if not any(sigma for sigma, _ in known):
-        return 1.0
-    sigma, radius = np.median(known, axis=0)
-    return 10.0 ** np.floor(np.log10(radius / sigma))
-
-
-def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """Returns points of the unit sphere on a spiral, and triangles between them; both sides of these are drawn."""
-    from scipy.spatial import ConvexHull
-
-    place = np.arange(POINTS) + 0.5
-    height, turn = 1 - 2 * place / POINTS, np.pi * (1 + 5**0.5) * place
-    across = np.sqrt(1 - height**2)
-    points = np.column_stack([across * np.cos(turn), across * np.sin(turn), height])
-    return points, ConvexHull(points).simplices
-
-
 @dataclass(frozen=True, slots=True)
 class Form:
     suffix: str
-    write: Callable[[Content], str | bytes]
+    write: Callable[[Content], str]
     lost: str  # results among faces, circles, σ and cameras that the files do not hold
 
 
@@ -445,8 +250,6 @@ FORMS = {
     "ros1": Form(".launch", lambda content: ros1_launch(content.statics(), _in_comments(content)), FRAMES_ONLY),
     "opencv": Form(".yml", opencv, "cameras"),
     "csv": Form(".csv", table, "cameras, correlations"),
-    "gltf": Form(".gltf", gltf, "the lens's distortion but as numbers in extras"),
-    "glb": Form(".glb", glb, "the lens's distortion but as numbers in extras"),
 }
 """Forms by the value of ``--form``."""
 
@@ -462,7 +265,7 @@ class ExportedRun:
 
 @require_arguments
 def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target") -> ExportedRun:
-    """Writes faces and circles to a new file, with σ and cameras if the form holds them, and returns the content.
+    """Writes faces and circles to a new file, with σ if the form holds them, and returns the content.
 
     Parameters
     ----------
@@ -470,8 +273,8 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
         New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
-        and 1), ``.yml`` (OpenCV), ``.csv``, ``.gltf`` or ``.glb``.
-    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv", "gltf", "glb"}, optional
+        and 1), ``.yml`` (OpenCV) or ``.csv``.
+    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv"}, optional
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.
@@ -493,7 +296,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     content = content_of(saved_run(run), name)
     written = FORMS[form].write(content)
     save(path, written)
-    require_same(path, path.read_bytes, written.encode() if isinstance(written, str) else written)
+    require_same(path, path.read_bytes, written.encode())
     return ExportedRun(path, form, content)
 
 

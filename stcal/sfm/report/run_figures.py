@@ -1,4 +1,4 @@
-"""The figures of a run's page: residuals of the board, over the image, by photograph, over their σ, and the halves."""
+"""The figures of a run's page: residuals of the board, over the image, by photograph, and over their σ."""
 
 import numpy as np
 
@@ -75,23 +75,4 @@ def normalised_residuals(values: np.ndarray) -> Drawing:
     beyond = 100 * float((np.abs(values) > 3).mean())
     said = f"{len(values)} coordinates, {beyond:.2f} % beyond 3 σ; line: N(0, 1), 0.27 %"
     drawing.words(((axes.box[0] + axes.box[2]) / 2, 9), said, svg.SMALL)
-    return drawing
-
-
-def halves(measured: list[dict]) -> Drawing:
-    """Draws how far two halves of the photographs have each face apart, with what chance explains; ``measured`` : of
-    the check of this name."""
-    rows = sorted(measured, key=lambda row: row["name"])
-    drawing = Drawing(4.3, 0.75 + 0.22 * len(rows))
-    reach = svg.limits([row[key] or 0.0 for row in rows for key in ("value", "limit")], 0.08, low=0)
-    axes = Axes(drawing, drawing.panels(left=60, top=18)[0], reach, (len(rows) - 0.4, -0.6))
-    at = np.arange(len(rows))
-    axes.frame(f"apart, {rows[0]['unit']}", "", "x", None, (list(range(len(rows))), [row["name"][:12] for row in rows]))
-    limit = [row["limit"] or 0.0 for row in rows]
-    axes.lines([([0, end], [k, k]) for k, end in enumerate(limit)], svg.AXIS, 2)
-    axes.marks(limit, at, "bar", 9, svg.AXIS)
-    axes.marks([row["value"] for row in rows], at, "dot", 5, svg.COLOURS[0])
-    drawing.words(
-        ((axes.box[0] + axes.box[2]) / 2, 9), "dot: the two halves apart; whisker: limit of chance", svg.SMALL
-    )
     return drawing

@@ -34,7 +34,7 @@ from stcal.report.svg import AXIS_COLOURS, COLOURS, INK, round_below
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, count_verdicts
 from stcal.sfm.report.judgement import SIZES, Judgement, judgement_of, without_sigma
-from stcal.sfm.report.run_figures import board_residuals, by_photograph, halves, normalised_residuals, residual_field
+from stcal.sfm.report.run_figures import board_residuals, by_photograph, normalised_residuals, residual_field
 
 FIRST_IMAGES = 100  # number of rows and overlays that the page has room for
 LONGEST = 0.04  # length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width
@@ -386,12 +386,10 @@ def checks_section(checks_of_report: list[dict]) -> list[Block]:
             chance = NONE if m.probability is None else f"{m.probability:.1g}"
             measured.append([check.title, m.name, *m.texts(), chance])
     passed = f"{len(others)} checks that passed, were not possible or not applicable"
-    halved = next((check for check in checks_of_report if check["key"] == "halves" and check["measured"]), None)
     return [
         f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
         "images or points it tested",
         Table(heads, open_, css="text"),
-        plots(plot(partial(halves, halved["measured"]), halved["title"], css="")) if halved else "",
         fold(passed, Table(heads, others, css="text")),
         fold("What was measured", Table(of_values, measured, css="text")),
     ]

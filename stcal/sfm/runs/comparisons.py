@@ -1,9 +1,10 @@
 """Comparisons of a run: with the published method of Zhang & Wei (2017), step by step on the same photographs, and with
 the native COLMAP; both are sections of ``report.json``."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from pydantic import Field
@@ -31,6 +32,12 @@ STEPS = ("centres of blurred edges", "eccentricity", "weights", "joint adjustmen
 class FaceOff(Part):
     translation_um: float
     rotation_mdeg: float
+
+    @classmethod
+    def of(cls, difference: np.ndarray, **more: Any) -> Self:
+        """Returns the lengths of turn and shift of a difference (6,) of two poses, rad and mm."""
+        turn, shift = np.linalg.norm(difference.reshape(2, 3), axis=1).tolist()
+        return cls(translation_um=MICRO * shift, rotation_mdeg=MICRO * math.degrees(turn), **more)
 
 
 class ComparedRow(Part):
@@ -78,7 +85,7 @@ def compare_with_paper(result: "RunResult", published: MethodResult | StcalError
     last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
     rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
     others = {face: c for face, c in whole.face_covariance.items() if face != whole.reference_face}
-    sigma = {face: _off(np.trace(c[3:, 3:]) ** 0.5, np.trace(c[:3, :3]) ** 0.5) for face, c in others.items()}
+    sigma = {face: FaceOff.of(np.sqrt(np.diag(c))) for face, c in others.items()}
     return Comparison(method="paper", rows=[ComparedRow(**row.model_dump()) for row in rows], sigma=sigma)
 
 
@@ -107,16 +114,10 @@ def _row(name: str, found: MethodResult | StcalError, whole: CalibratedTarget, c
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
         return ComparedRow(method=name, missing=others, reason=str(found))
-    faces = {}
-    for face in (face for face in found.target.target_from_face if face in others):
-        pose, known = found.target.target_from_face[face], whole.target_from_face[face]
-        faces[face] = _off(np.linalg.norm(pose.translation - known.translation), (pose @ known.inverse()).angle_rad())
+    poses, known = found.target.target_from_face, whole.target_from_face
+    faces = {face: FaceOff.of(poses[face].difference(known[face])) for face in poses if face in others}
     missing = [face for face in others if face not in faces]
     return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
-
-
-def _off(translation_mm: float | np.floating, rotation_rad: float) -> FaceOff:
-    return FaceOff(translation_um=MICRO * float(translation_mm), rotation_mdeg=MICRO * float(np.degrees(rotation_rad)))
 
 
 def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, Scale]) -> dict[str, Any]:
@@ -169,11 +170,7 @@ class Tolerances:
         return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
 
     def __post_init__(self):
-        for name, value in asdict(self).items():
-            if isinstance(value, int | float) and not 0 <= value < np.inf:
-                fault = f"tolerance {name} {value:g}: a number of 0 or more needed"
-                raise InputError("E-OPTION-RANGE", f"{fault}; give another")
-        require_fields(self, "tolerances")
+        require_fields(self, "tolerances", **dict.fromkeys((each.name for each in fields(self)), 0.0))
 
 
 def allowed_text(tolerances: Tolerances) -> str:

@@ -1,10 +1,10 @@
 """A run: what it was given and what it found, just made, or read back from its folder for every command that continues
 from it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -45,13 +45,8 @@ from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import GroupSolution
 from stcal.sfm.runs.transaction import AGAIN, MarkerFile, as_written, complete_interrupted, read_marker, require_run
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 Value = TypeVar("Value")
-Rows = Literal["faces", "circles", "images", "observations"]  # tables of :meth:`RunResult.to_dataframe`
 COLUMNS = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", "var_x_px2", "cov_xy_px2", "var_y_px2")
-OF_POSE = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -310,46 +305,6 @@ class RunResult(SavedRun):
             for image in self.observations
         }
 
-    def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
-        """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
-
-        Parameters
-        ----------
-        rows : {"faces", "circles", "images", "observations"}
-            ``faces``: place, rotation vector and σ of each face, target frame; ``circles``: the calibrated circles;
-            ``images``: pose of each image; ``observations``: each circle in each image, with its residual.
-
-        Raises
-        ------
-        InputError
-            pandas is not installed, or there is no such table.
-        """
-        if rows not in get_args(Rows):
-            raise InputError("E-OPTION-VALUE", f"table of {rows!r}: not a choice; use {', '.join(get_args(Rows))}")
-        try:
-            from pandas import DataFrame
-        except ImportError as error:
-            fault = "DataFrame: needs pandas"
-            raise InputError("E-EXTRA-MISSING", f"{fault}; install stereo-target-calibration[pandas]") from error
-        target, table = self.target, []
-        if rows == "faces":
-            for face, pose in target.target_from_face.items():
-                table.append({"face": face} | _cells(OF_POSE, pose.log(), target.face_covariance.get(face)))
-        elif rows == "circles":
-            for label, xyz in target.circles.items():
-                cells = _cells(OF_POSE[3:], xyz, target.circle_covariance.get(label))
-                table.append({"label": str(label), "face": label.face} | cells)
-        for image in self.images() if rows in ("images", "observations") else ():
-            place = {"image": image.name, "group": image.group}
-            if rows == "images":
-                cells = _cells(OF_POSE, image.camera_from_target.log(), image.covariance)
-                table.append(place | cells | {"circles": len(image.labels), "rms_px": image.rms_px})
-                continue
-            columns = ("x_px", "y_px", "residual_x_px", "residual_y_px")
-            for label, row in zip(image.labels, np.hstack([image.xy_px, image.residuals_px]).tolist(), strict=True):
-                table.append(place | {"label": str(label)} | dict(zip(columns, row, strict=True)))
-        return DataFrame(table)
-
     @property
     def refined_camera(self) -> Camera | None:
         """Camera as adjusted, with covariance; None if the intrinsics were held fixed."""
@@ -375,13 +330,6 @@ class RunResult(SavedRun):
             camera_given=self.camera_given,
             blur_px={name: float(np.median(edge_blur)) for name, edge_blur in blur.items() if len(edge_blur)},
         )
-
-
-def _cells(names: Sequence[str], values: np.ndarray, covariance: np.ndarray | None) -> dict[str, float]:
-    """Returns the cells of values and their σ, NaN without a covariance."""
-    sigma = np.full(len(names), np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
-    sigmas = zip([f"sigma_{name}" for name in names], sigma.tolist(), strict=True)
-    return dict(zip(names, values.tolist(), strict=True)) | dict(sigmas)
 
 
 class ImageRow(Part):

@@ -1,6 +1,5 @@
-"""A run's faces, circles, σ and cameras read back from every form by the programs that take them."""
+"""A run's faces, circles and σ read back from every form by the programs that take them."""
 
-import base64
 import csv
 import importlib
 import json
@@ -19,8 +18,6 @@ from tests.support.static_transforms import read_messages, read_ros1_launch, rea
 
 AGAIN_MM = 1e-9
 """Doubles in their shortest text, by way of metres and quaternions."""
-FLOAT_MM = 1e-4
-"""Single precision at a metre: 6e-5 mm."""
 
 
 @pytest.fixture(scope="module")
@@ -128,53 +125,6 @@ def test_table(files, faces):
             variance = np.diag(faces["circle_covariance_mm2"][label])
             np.testing.assert_allclose(sigma, 1e3 * np.sqrt(variance), rtol=1e-3)
     assert [row["kind"] for row in rows].count("circle") == len(faces["circles"])
-
-
-@pytest.mark.parametrize("form", ["gltf", "glb"])
-def test_gltf(files, faces, form, small_run):
-    """Circles and cameras at their places in a general viewer; covariances in the nodes' own data."""
-    trimesh = importlib.import_module("trimesh")
-    scene = trimesh.load(files[form])
-    y_up_from_target = Rotation.from_rotvec([-np.pi / 2, 0, 0]).as_matrix()
-    for label, xyz in faces["circles"].items():
-        own = parse_label(label)
-        world_from_circle, _ = scene.graph[f"box_{own.face}_{own.circle}"]
-        np.testing.assert_allclose(1e3 * world_from_circle[:3, 3], y_up_from_target @ xyz, atol=FLOAT_MM)
-        turn = y_up_from_target @ np.array(faces["target_from_face"][own.face])[:3, :3]
-        np.testing.assert_allclose(world_from_circle[:3, :3], turn, atol=1e-6)
-    tree, data = content_of_gltf(files[form])
-    assert tree["buffers"][0]["byteLength"] == sum(view["byteLength"] for view in tree["bufferViews"]) == len(data)
-    nodes = {node["name"]: node for node in tree["nodes"]}
-    (factor,) = {node["extras"]["sigma_drawn_times"] for node in [nodes["box"]]}
-    for label, covariance in faces["circle_covariance_mm2"].items():
-        own = parse_label(label)
-        assert nodes[f"box_{own.face}_{own.circle}"]["extras"]["covariance_mm2"] == covariance
-        ball = nodes[f"sigma of {label}, times {factor:g}"]
-        turn = Rotation.from_quat(ball["rotation"]).as_matrix()
-        face = np.array(faces["target_from_face"][own.face])[:3, :3]
-        drawn = face @ turn @ np.diag(1e3 * np.array(ball["scale"]) / factor) ** 2 @ turn.T @ face.T
-        np.testing.assert_allclose(drawn, covariance, atol=1e-9 * np.abs(covariance).max() + 1e-18)
-    y_up = Rotation.from_quat(nodes["y_up"]["rotation"]).as_matrix()
-    np.testing.assert_allclose(y_up, y_up_from_target, atol=1e-12)
-    for camera in json.loads((small_run / "report.json").read_text(encoding="utf-8"))["scene"]["cameras"]:
-        own = nodes[camera["image"]]
-        np.testing.assert_allclose(1e3 * np.array(own["translation"]), camera["position_mm"], atol=AGAIN_MM)
-        turn = Rotation.from_quat(own["rotation"]).as_matrix()
-        np.testing.assert_allclose(turn.T * [[1], [-1], [-1]], camera["axes"], atol=1e-12)  # it looks along −Z, Y up
-    lens = tree["cameras"][0]
-    assert lens["perspective"]["yfov"] == pytest.approx(
-        2 * np.arctan(lens["extras"]["size_px"][1] / 2 / lens["extras"]["focal_px"][1])
-    )
-
-
-def content_of_gltf(path) -> tuple[dict, bytes]:
-    raw = path.read_bytes()
-    if path.suffix == ".gltf":
-        tree = json.loads(raw)
-        return tree, base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
-    length = int.from_bytes(raw[12:16], "little")
-    tree = json.loads(raw[20 : 20 + length])
-    return tree, raw[28 + length :]
 
 
 @pytest.mark.parametrize(

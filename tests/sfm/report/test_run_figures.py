@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from stcal.sfm.report.run_figures import by_photograph, halves, normalised_residuals, residual_field
+from stcal.sfm.report.run_figures import by_photograph, normalised_residuals, residual_field
 from stcal.sfm.runs import folder
 
 
@@ -34,10 +34,6 @@ def test_mean_residuals_stand_in_their_cells_with_their_number():
     assert any(text.startswith("0.02 px") for text in seen)
 
 
-def test_the_worst_photograph_is_named_and_halves_have_their_limits():
+def test_the_worst_photograph_is_named():
     rows = [{"image": f"{i}.jpg", "rms_px": rms} for i, rms in enumerate((0.01, 0.05, 0.02))]
     assert [text for text in words(by_photograph(rows)) if text.endswith(".jpg")] == ["1.jpg"]
-    faces = [{"name": f"face {i}", "value": 3.0 * i, "limit": 10.0, "unit": "µm"} for i in (4, 2)]
-    seen = words(halves(faces))
-    assert seen.index("face 2") < seen.index("face 4")
-    assert "apart, µm" in seen
