@@ -387,16 +387,13 @@ def input_notes() -> Iterator[None]:
 def designs_told(
     target: Path | None, board: Path | None, with_target: bool = True, with_board: bool = True
 ) -> Iterator[None]:
-    """Prints which reference designs are assumed (unless switched off), and which faces are nearly alike; errors within
-    the context name the designs."""
+    """Prints which reference designs are assumed (unless switched off); errors within the context name them."""
     from stcal.boards.target_file import target_of
     from stcal.design import reference_board, reference_target
-    from stcal.sfm.detect.face_patterns import likeness_notes
 
     assumed = []
     if target is not None:
-        print_each("note", likeness_notes(design := target_of(target)))
-        with_board = with_board and not design.has_scale
+        with_board = with_board and not target_of(target).has_scale
     elif with_target:
         faces = reference_target().faces
         assumed.append(f"the reference target, {len(faces)} faces of {len(faces[0].ids)} circles (no --target)")

@@ -27,7 +27,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS
 from stcal.sfm.checks.board_checks import shows_rim
 from stcal.sfm.checks.significance import MOST_SIGMAS, Evidence
 from stcal.sfm.checks.suite import cause_of_drawing, cause_of_size, run_checks
-from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, misnamed_groups, not_as_drawn
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, Note, lost_groups, not_as_drawn
 from stcal.sfm.detect.detect_files import PHOTOGRAPHS, files_of_arrays
 from stcal.sfm.mapping.body import plain_lens
 from stcal.sfm.report.check import Check
@@ -218,7 +218,6 @@ def result_of(task: Task, seen: DetectedImages, groups: Groups, calibration: Cal
             *groups.unsolved,
             *calibration.notes,
             *not_as_drawn(faces, target, has_board and set(groups.names) == {TOP_GROUP}),
-            *(misnamed_groups(groups.observations, target) if has_board else ()),
             *groups.unseen_notes(target),
             *(Note(tags, NOT_AS_DRAWN, remedy="correct the ids in target.toml", then=": ") for tags in strange),
         ),

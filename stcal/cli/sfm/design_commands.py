@@ -229,13 +229,9 @@ def draw(
     net: Annotated[bool, "Draw a target's plates as one net to fold, using outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
-    from stcal.design import TargetDesign
     from stcal.drawing.draw import draw as drawn
-    from stcal.drawing.draw import drawn_text, load_design
-    from stcal.sfm.detect.face_patterns import likeness_notes
+    from stcal.drawing.draw import drawn_text
 
-    if isinstance(target := load_design(design), TargetDesign):
-        print_each("note", likeness_notes(target))
     say(drawn_text(drawn(design, out, paper, margin_mm, net)))
 
 
@@ -267,7 +263,6 @@ def design(
     from stcal.drawing.draw import net_text
     from stcal.io.cameras.read import read_camera
     from stcal.sfm import make
-    from stcal.sfm.detect.face_patterns import likeness_notes
     from stcal.sfm.planning.session import PlanOptions, plan_text
     from stcal.synthetic import designs
 
@@ -288,7 +283,6 @@ def design(
         with StageProgress() as progress:
             made = make.design_target(options, images, folder, progress)
     if made.made is not None:
-        print_each("note", likeness_notes(made.target))
         say(make.made_text(made.made))
         if made.board is not None:
             say(f"board: {shared.board_in_words(made.board)}")

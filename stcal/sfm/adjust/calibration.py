@@ -216,29 +216,17 @@ def _faces(
     models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Returns the frames of the faces in all groups, and notes. Frame circles that a group lacks are placed by the
-    others, as other groups or the design have them; the joint adjustment starts from there."""
+    others, as other groups have them; the joint adjustment starts from there."""
     results = [chain.faces_of_group(model, camera, target, options.frame) for model in models]
     places: dict[str, dict[str, list[np.ndarray]]] = {}
     for face in (face for group_faces, _ in results for face in group_faces):
         for label, xyz in zip(face.labels, face.xyz_face, strict=True):
             places.setdefault(face.face, {}).setdefault(label.circle, []).append(xyz)
-    circles_by_face = {
-        face: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face, centres in places.items()
-    }
+    known = {face: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face, centres in places.items()}
     if any(notes for _, notes in results):
-        known = {face.id: circles_by_face.get(face.id) for face in target.faces}
         results = [chain.faces_of_group(model, camera, target, options.frame, known) for model in models]
-    notes = [note for _, group_notes in results for note in group_notes]
-    mapped = {label for m in models for label in m.labels}
-    for face_id in sorted({face.face for group_faces, _ in results for face in group_faces} - circles_by_face.keys()):
-        face = target.face(face_id)
-        unseen = chain.missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
-        if unseen:
-            names = ", ".join(f"{face_id}:{circle}" for circle in unseen)
-            place = "it stands where the design has it against the face's other circles"
-            doubt = "and σ carries how far circles are off the design"
-            notes.append(f"face {face_id}: frame circle {names} not mapped; {place}, {doubt}")
-    return [face for group_faces, _ in results for face in group_faces], notes
+    faces, notes = ([each for parts in of_kind for each in parts] for of_kind in zip(*results, strict=True))
+    return faces, notes
 
 
 def _adjust_all(

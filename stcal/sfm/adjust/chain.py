@@ -1,18 +1,18 @@
 """Face frames from circle centres, the faces of each group, and their chaining into the target frame."""
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, MappingError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
+from stcal.geometry.least_squares import UNKEPT
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
@@ -44,49 +44,16 @@ class FaceInGroup:
         freeze(self, "information", (n, 3, 3), "information")
 
 
-def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
-    """Returns the circles of the face's frame that are not mapped; none for a face of known shape."""
-    if face.sigma_mm is not None:
-        return ()
-    return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
-
-
-def with_unmapped(
-    face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None
+def with_known(
+    face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Returns the circles (3,) by id, unmapped ones of the frame by a rigid fit to the design or ``known`` places."""
-    missing = missing_frame_circles(face, xyz)
-    if not missing:
+    """Returns the circles (3,) by id, with frame circles that are not mapped by a rigid fit to ``known`` places."""
+    missing = [c for c in (face.origin, face.x, face.y) if c in known and c not in xyz]
+    common = [c for c in xyz if c in known]
+    if face.sigma_mm is not None or not missing or len(common) < MIN_PLACING:
         return dict(xyz)
-    known = dict(zip(face.ids, face.places_mm(face.ids), strict=True)) if known is None else known
-    common = [circle for circle in xyz if circle in known]
-    if len(common) < MIN_PLACING:
-        raise _unmapped(face, missing, f", and {len(common)} other circles, {MIN_PLACING} needed")
-    try:
-        model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
-    except DegenerateError as error:
-        raise _unmapped(face, missing) from error
-    return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
-
-
-def _unmapped(face: FaceDesign, missing: Sequence[str], more: str = "") -> DegenerateError:
-    names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-    words = f"face {face.id}: frame circle {names} not mapped{more}; add views that show it"
-    return DegenerateError("E-FACE-FRAME-CIRCLES", words)
-
-
-def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
-    """Returns the in-plane σ per axis of circles (3,) about the design, pooled over rigid fits of the faces."""
-    square, redundancy = 0.0, 0
-    for face in target.faces:
-        centres = {label.circle: place for label, place in xyz.items() if label.face == face.id}
-        mapped, design = np.array(list(centres.values())), face.places_mm(centres)
-        with suppress(DegenerateError):
-            if len(centres) >= MIN_PLACING:
-                away = align_rigid(mapped, design).inverse() @ mapped - design
-                square += float((away[:, :2] ** 2).sum())
-                redundancy += 2 * len(centres) - 3
-    return float(np.sqrt(square / redundancy)) if redundancy else 0.0
+    model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
+    return dict(xyz) | {c: model_from_known @ known[c] for c in missing}
 
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
@@ -103,8 +70,10 @@ def face_frames(
     design, laid over all of its points by least squares."""
     if face.sigma_mm is not None:
         return _fitted(face, circles, xyz)
-    if missing := missing_frame_circles(face, circles):
-        raise _unmapped(face, missing)
+    if missing := [circle for circle in (face.origin, face.x, face.y) if circle not in circles]:
+        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+        words = f"face {face.id}: frame circle {names} not mapped; add views that show it"
+        raise DegenerateError("E-FACE-FRAME-CIRCLES", words)
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_plane(xyz, towards)
@@ -137,10 +106,10 @@ def faces_of_group(
     camera: Camera,
     target: TargetDesign,
     kind: FrameKind,
-    known: Mapping[str, Mapping[str, np.ndarray] | None] | None = None,
+    known: Mapping[str, Mapping[str, np.ndarray]] | None = None,
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles of
-    ``known`` faces may be placed by their other circles."""
+    """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles that it
+    lacks are placed by those that it has, where other groups know both: ``known``, by face and circle."""
     xyz = model.xyz_model
     by_point = model.whiten(projection_jacobians(model, camera)[1])
     information = np.zeros((len(model.labels), 3, 3))  # inverse covariance of each point, given the cameras, mm⁻²
@@ -155,9 +124,8 @@ def faces_of_group(
         observed = np.isin(model.point_index, members)
         seen_by = np.unique(model.image_index[observed])
         try:
-            if known is not None and face.id in known:
-                place = with_unmapped(face, place, known[face.id])
-            frame = face_frame(face, place, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
+            every = with_known(face, place, (known or {}).get(face.id, {}))
+            frame = face_frame(face, every, kind, cameras[seen_by].mean(0) - xyz[members].mean(0))
         except DegenerateError as error:
             notes.append(f"group {model.group}: {error}")
             continue
@@ -300,37 +268,28 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
 def _adjust(
     faces: Sequence[FaceInGroup], from_face: dict[str, Rigid], from_group: dict[str, Rigid], reference: str
 ) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Estimates the poses of faces and groups in the target frame. Poses are perturbed on the right, so that the step
-    of a face enters its residual with the factor −1."""
+    """Estimates the poses of faces and groups in the target frame: what each group sees of a face, with the
+    information of its circles, ties one of either."""
     roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
     for own in faces:
         by_pose = np.concatenate([-skew(own.xyz_face), np.broadcast_to(np.eye(3), (len(own.labels), 3, 3))], axis=2)
         information = np.einsum("nki,nkl,nlj->ij", by_pose, own.information, by_pose)
         roots.append(np.linalg.cholesky(information + 1e-12 * np.eye(6)).T)
-    free = [("face", f) for f in from_face if f != reference]
-    free += [("group", g) for g in dict.fromkeys(own.group for own in faces)]
-    column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(free)}
-    initial = {("face", f): pose for f, pose in from_face.items()} | {("group", g): p for g, p in from_group.items()}
+    ids, names, seen = list(from_face), list(from_group), Poses.of(own.group_from_face for own in faces)
+    face, group = np.array([(ids.index(own.face), names.index(own.group)) for own in faces]).T
+    a = Adjustment()
+    on_faces = a.block("faces", Poses.of(from_face.values()), fixed=[ids.index(reference)])
+    on_groups = a.block("groups", Poses.of(from_group.values()))
 
-    def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
-        jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
-        for k, (own, root) in enumerate(zip(faces, roots, strict=True)):
-            rows, group, face = slice(6 * k, 6 * k + 6), ("group", own.group), ("face", own.face)
-            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ own.group_from_face).log()
-            r, t = own.group_from_face.rotation.T, own.group_from_face.translation
-            jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
-            if face in column:
-                jacobian[rows, column[face]] = -root
-        return NormalEquations.of(residual, jacobian)
+    def apart(of_faces: Poses, of_groups: Poses) -> np.ndarray:
+        chained = of_faces[face].inverse() @ of_groups[group] @ seen
+        return np.array([pose.log() for pose in chained])
 
-    def moved(poses: dict[tuple[str, str], Rigid], step: np.ndarray) -> dict[tuple[str, str], Rigid]:
-        return poses | {name: poses[name] @ Rigid.exp(step[at]) for name, at in column.items()}
-
-    solution = minimise(initial, linearise, moved)
-    # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
-    # iteration ends when they gain nothing.
-    poses = solution.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
-    return {f: poses["face", f] for f in from_face}, {g: poses["group", g] for g in from_group}
+    a.factor(apart, [(on_faces, face), (on_groups, group)], root=np.array(roots))
+    # If groups disagree, only damped steps lower the cost, and iteration ends when they gain nothing.
+    minimum = a.minimum().required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT)
+    poses = minimum.state
+    return dict(zip(ids, poses["faces"], strict=True)), dict(zip(names, poses["groups"], strict=True))
 
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:

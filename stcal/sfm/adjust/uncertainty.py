@@ -1,16 +1,15 @@
 """Covariances of faces and circles, and what each kind of observation contributes to them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from stcal.design import FaceDesign, TargetDesign
+from stcal.design import TargetDesign
 from stcal.geometry.arrays import rms
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust import chain, equations
 from stcal.sfm.adjust.chain import CalibratedTarget, FrameKind
 from stcal.sfm.adjust.equations import BOARD, CIRCLES, DOTS
@@ -28,17 +27,10 @@ class Derivatives:
     target_from_model: Rigid
     faces: dict[str, np.ndarray]  # by face, (6, 3c) rad and mm, perturbation in the target frame
     circles: np.ndarray  # (c, 3, 3c)
-    face_designed: dict[str, np.ndarray]  # by face, (6, d) by in-plane positions of frame circles that were not mapped
-    circles_designed: np.ndarray  # (c, 3, d)
-    designed_sigma_mm: float  # of these positions
-
-    def _covariance(self, covariance_mm2: np.ndarray, by_circles: np.ndarray, designed: np.ndarray) -> np.ndarray:
-        return by_circles @ covariance_mm2 @ by_circles.T + self.designed_sigma_mm**2 * designed @ designed.T
 
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """Returns 6×6 by face from the covariance (3c, 3c) of the circles, in any datum."""
-        parts = ((face, own, self.face_designed[face]) for face, own in self.faces.items())
-        return {face: self._covariance(covariance_mm2, own, designed) for face, own, designed in parts}
+        return {face: own @ covariance_mm2 @ own.T for face, own in self.faces.items()}
 
     def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
         """Returns σ of the distance between the origins of every two faces."""
@@ -46,8 +38,8 @@ class Derivatives:
         for a, b in combinations(self.target_from_face, 2):
             offset = self.target_from_face[b].translation - self.target_from_face[a].translation
             along = offset / np.linalg.norm(offset)
-            apart = (along @ (own[b][3:] - own[a][3:]) for own in (self.faces, self.face_designed))
-            sigma[a, b] = float(np.sqrt(max(self._covariance(covariance_mm2, *apart), 0.0)))
+            apart = along @ (self.faces[b][3:] - self.faces[a][3:])
+            sigma[a, b] = float(np.sqrt(max(apart @ covariance_mm2 @ apart, 0.0)))
         return sigma
 
     def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
@@ -57,9 +49,8 @@ class Derivatives:
 
     def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """Returns (3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
-        rows = 3 * len(self.circles)
-        parts = self.circles.reshape(rows, -1), self.circles_designed.reshape(rows, -1)
-        return self._covariance(covariance_mm2, *parts)
+        by_circles = self.circles.reshape(3 * len(self.circles), -1)
+        return by_circles @ covariance_mm2 @ by_circles.T
 
 
 def calibrated_target(
@@ -102,65 +93,34 @@ def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
 
 def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
     """Computes the derivatives of poses and circles in the target frame by all circles, by central differences."""
-    faces = {
-        face.id: _moved_face(face, result, start.target_from_face[face.id].rotation[:, 2], kind)
-        for face in target.faces
-        if face.id in start.target_from_face
-    }
-    poses = {moved: frames(np.zeros((1, len(rows), 3)))[0] for moved, (rows, _, frames) in faces.items()}
+    width = 3 * len(result.labels)
+    poses: dict[str, Rigid] = {}
+    by_model: dict[str, np.ndarray] = {}  # (6, 3c) of model_from_face
+    for face in target.faces:
+        if face.id not in start.target_from_face:
+            continue
+        rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
+        names, towards = tuple(result.labels[i].circle for i in rows), start.target_from_face[face.id].rotation[:, 2]
+        xyz, moves = result.xyz_model[rows], STEP_MM * np.eye(3 * len(rows)).reshape(3 * len(rows), len(rows), 3)
+        places = [xyz[None], xyz + moves, xyz - moves]
+        place, ahead, behind = (chain.face_frames(face, names, each, kind, towards) for each in places)
+        poses[face.id], by_model[face.id] = place[0], np.zeros((6, width))
+        by_model[face.id][:, equations.coordinates(rows)] = ahead.difference(behind).T / (2 * STEP_MM)
     target_from_model = poses[start.reference_face].inverse()
-    mapped = at = 3 * len(result.labels)  # after the circles come the placed ones, by two coordinates
-    width = mapped + 2 * sum(p for _, p, _ in faces.values())
-    by_model = {face_id: np.zeros((6, width)) for face_id in poses}  # of model_from_face
-    for moved, (rows, p, frames) in faces.items():
-        m, columns = 3 * len(rows), np.append(equations.coordinates(rows), at + np.arange(2 * p))
-        at += 2 * p
-        moves = np.eye(m + 2 * p, m).reshape(-1, len(rows), 3)
-        shifts = np.zeros((m + 2 * p, p, 3))  # in the plane of the face, where the design gives their places
-        shifts[m:] = np.einsum("pq,ja->pjqa", np.eye(p), poses[moved].rotation[:, :2].T).reshape(2 * p, p, 3)
-        ahead, behind = (frames(sign * STEP_MM * moves, sign * STEP_MM * shifts) for sign in (1, -1))
-        by_model[moved][:, columns] = ahead.difference(behind).T / (2 * STEP_MM)
     frame, origin, turn = by_model[start.reference_face], poses[start.reference_face], target_from_model.rotation
 
     def in_target(place: np.ndarray, move: np.ndarray) -> np.ndarray:
-        """Returns how a place (3,) changes in the target frame, which moves too; ``move`` (3, w) in the model."""
+        """Returns how a place (3,) changes in the target frame, which moves too; ``move`` (3, 3c) in the model."""
         return turn @ (move - frame[3:] + skew(place - origin.translation) @ frame[:3])
 
     by_face = {
         face_id: np.vstack([turn @ (by[:3] - frame[:3]), in_target(poses[face_id].translation, by[3:])])
         for face_id, by in by_model.items()
     }
-    moves = np.eye(mapped, width).reshape(-1, 3, width)
+    moves = np.eye(width).reshape(-1, 3, width)
     circles = np.array([in_target(*each) for each in zip(result.xyz_model, moves, strict=True)])
-    sigma = 0.0
-    if width > mapped:
-        sigma = chain.placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
     places = {face_id: target_from_model @ pose for face_id, pose in poses.items()}
-    by_mapped, designed = (
-        ({face_id: jacobian[:, part] for face_id, jacobian in by_face.items()}, circles[:, :, part])
-        for part in (slice(mapped), slice(mapped, None))
-    )
-    return Derivatives(places, target_from_model @ result.xyz_model, target_from_model, *by_mapped, *designed, sigma)
-
-
-def _moved_face(
-    face: FaceDesign, result: JointResult, towards: np.ndarray, kind: FrameKind
-) -> tuple[np.ndarray, int, Callable[..., Poses]]:
-    """Returns the places (m,) of the face's circles among all, the number of frame circles that were not mapped, and
-    the function of model_from_face after k sets of moves (k, m, 3), and of shifts (k, p, 3) of those, mm."""
-    rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
-    circles = tuple(result.labels[i].circle for i in rows)
-    placed = chain.missing_frame_circles(face, circles)
-
-    def frames(moves: np.ndarray, shifts: np.ndarray | float = 0.0) -> Poses:
-        xyz, names = result.xyz_model[rows] + moves, circles
-        if placed:
-            sets = [chain.with_unmapped(face, dict(zip(circles, centres, strict=True))) for centres in xyz]
-            xyz, names = np.array([list(centres.values()) for centres in sets]), tuple(sets[0])
-            xyz[:, [names.index(circle) for circle in placed]] += shifts
-        return chain.face_frames(face, names, xyz, kind, towards)
-
-    return rows, len(placed), frames
+    return Derivatives(places, target_from_model @ result.xyz_model, target_from_model, by_face, circles)
 
 
 FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES = "flatness", "intrinsics", "print", "sizes", "distances"

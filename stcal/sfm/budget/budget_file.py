@@ -169,7 +169,7 @@ def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = (
     """Returns a corrected length of the run, with its variance by all sources except ``without``."""
     measurand = combine.distance(budget.joint, *ends)
     used = [each for each in budget.sources if each.key not in without]
-    variances = [float(measurand.covariance(each, 0.0)[0, 0]) for each in used]
+    variances = [float(measurand.covariance(each)[0, 0]) for each in used]
     estimated = sum(variance for each, variance in zip(used, variances, strict=True) if each.evaluation == "A")
     return measurand.length_mm * (1 + budget.conditions.correction), sum(variances), estimated**2 / budget.freedom
 

@@ -342,25 +342,18 @@ class Measurand:
     kind: Kind
     of: tuple[str, ...]  # the face, two faces, or two circles
     jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
-    designed: np.ndarray  # (r, d) by the frame circles that were not mapped
     length_mm: float = 0.0  # of a distance
 
     def __post_init__(self):
-        for name in ("jacobian", "designed"):
-            freeze(self, name, (None, None), f"{self.name}: {name}")
+        freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
 
     @property
     def name(self) -> str:
         return " – ".join(self.of)
 
-    def covariance(self, source: BudgetSource, designed_sigma_mm: float) -> np.ndarray:
-        """Covariance (r, r) from one source; ``designed_sigma_mm`` matters only for the source of placed circles."""
-        if source.key == PLACED:
-            return designed_sigma_mm**2 * self.designed @ self.designed.T
+    def covariance(self, source: BudgetSource) -> np.ndarray:
+        """Covariance (r, r) from one source."""
         return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
-
-
-PLACED = "placed_circles"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -442,16 +435,11 @@ def budget(
     reference_face: str,
 ) -> Budget:
     """Returns the budget of an adjustment by its sources."""
-    if own.circles_designed.shape[2]:
-        words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
-        size, sigma_um = own.circles.shape[-1], 1e3 * own.designed_sigma_mm
-        none = np.zeros((size, size))  # it moves faces, not circles
-        sources += (BudgetSource(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
     rng = np.random.default_rng(0)
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
     every = measurands(joint, own, reference_face)
-    rows = tuple(_row(measurand, sources, own.designed_sigma_mm, freedom, rng) for measurand in every)
+    rows = tuple(_row(measurand, sources, freedom, rng) for measurand in every)
     views = tuple(GroupViews.of(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
@@ -468,8 +456,7 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
     other_faces = [face for face in own.target_from_face if face != reference_face]
     rows_of: dict[Kind, slice] = {"position": slice(3, 6), "rotation": slice(0, 3)}
     poses = [
-        Measurand(kind, (face,), own.faces[face][rows], own.face_designed[face][rows])
-        for (kind, rows), face in product(rows_of.items(), other_faces)
+        Measurand(kind, (face,), own.faces[face][rows]) for (kind, rows), face in product(rows_of.items(), other_faces)
     ]
     angles = [_angle(own, a, b) for a, b in combinations(own.target_from_face, 2)]
     longest = longest_of(joint.labels, joint.xyz_model)[:LONGEST_DISTANCES]
@@ -481,8 +468,7 @@ def _angle(own: Derivatives, a: str, b: str) -> Measurand:
     first, second = (own.target_from_face[face].rotation[:, 2] for face in (a, b))
     about = np.cross(first, second)[None]
     about = about / np.linalg.norm(about) if np.linalg.norm(about) > PARALLEL else null_space(first[None]).T
-    jacobian, designed = (about @ (by[b][:3] - by[a][:3]) for by in (own.faces, own.face_designed))
-    return Measurand("angle", (a, b), jacobian, designed)
+    return Measurand("angle", (a, b), about @ (own.faces[b][:3] - own.faces[a][:3]))
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
@@ -501,12 +487,12 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     jacobian = np.zeros(joint.xyz_model.shape)
     jacobian[j], jacobian[i] = difference / length, -difference / length
     ends = joint.labels[i], joint.labels[j]
-    return Measurand("distance", ends, jacobian.reshape(1, -1), np.zeros((1, 0)), length)
+    return Measurand("distance", ends, jacobian.reshape(1, -1), length)
 
 
-def _row(measurand: Measurand, sources: Sequence[BudgetSource], sigma_mm: float, freedom: int, rng: Generator) -> Row:
-    """Returns the uncertainty of a measurand; ``sigma_mm`` : of circles that were not mapped."""
-    covariances = {source.key: measurand.covariance(source, sigma_mm) for source in sources}
+def _row(measurand: Measurand, sources: Sequence[BudgetSource], freedom: int, rng: Generator) -> Row:
+    """Returns the uncertainty of a measurand."""
+    covariances = {source.key: measurand.covariance(source) for source in sources}
     covariance = np.sum(list(covariances.values()), axis=0)
     variance = float(np.trace(covariance))
     estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")

@@ -1,12 +1,10 @@
 """Data that the stages hand to each other: centres measured in an image; the model of a group, with camera poses and
-labelled points; and notes, on faces that are not where the design draws them, or not in groups named after them."""
+labelled points; and notes, on faces that are not where the design draws them."""
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from itertools import combinations
 from typing import Self, TypeVar
 
 import numpy as np
@@ -376,9 +374,6 @@ MOST_TURNED_DEG = 25.0
 body, or drawn turned, is off by far more."""
 FAR_DEG = 45.0  # angle from which a face is not the one that was drawn: half of that between two sides of a box
 LIKE_DRAWN = 1.3  # largest factor between distances of faces and those of their rough poses
-SHOWN, RARELY = 2, 3
-"""Number of images that must show a face before its group counts as one of it, and how many times as many must show it
-as a face that the group is named after."""
 
 
 def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, one_folder: bool = False) -> list[Note]:
@@ -398,11 +393,6 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
         return notes
     what = ", ".join(f"face {face} is turned by {angle:.0f}°" for face, angle in turned.items())
     what += " against rough_pose in target.toml"
-    for a, b in combinations(turned, 2):
-        exchanged = rough | {a: rough[b], b: rough[a]}
-        if not {a, b} & turned_faces(found, exchanged).keys():
-            what += f", as if the names of faces {a} and {b} were exchanged"
-            break
     folders = "put the photographs of each setting of target and board into a folder of its own; or " * one_folder
     return [*notes, Note(what, NOT_AS_DRAWN, remedy=f"{folders}correct names, ids or rough_pose", then=": ")]
 
@@ -415,22 +405,6 @@ def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict
         angles = {face: float(np.degrees(Rigid(anchor.T @ other).angle_rad())) for face, other in off.items()}
         turned.append({face: angle for face, angle in angles.items() if angle > MOST_TURNED_DEG})
     return min(turned, key=len)
-
-
-def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[Note]:
-    """Returns notes on groups that are named after faces, and show others in place of them."""
-    ids, notes = [face.id for face in design.faces], []
-    for group, images in by_group(observations).items():
-        named = faces_in_name(group, ids)
-        seen = Counter(face for image in images for face in image.face_ids())
-        others = [face for face, count in seen.items() if count >= SHOWN and face not in named]
-        most = max((seen[face] for face in others), default=0)
-        if named and most and any(RARELY * seen[face] < most for face in named):
-            shown = " and ".join(face for face, _ in seen.most_common(len(named)))
-            what = f"group {group} is named after faces {' and '.join(sorted(named))}, and shows {shown}"
-            remedy = "correct the names of faces in target.toml, or of folders"
-            notes.append(Note(what, NOT_AS_DRAWN, group, remedy, then=": "))
-    return notes
 
 
 def faces_in_name(group: str, ids: Sequence[str]) -> set[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian, singular_values
-from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
+from stcal.lookalikes import common_circles, mirrored_circles
 from stcal.sfm.detect.candidates import MAX_AXIS_RATIO, Candidates, FaceSighting, OpenFace, grow_matches
 
 MIN_NAMING = 6  # smallest number of circles that can name a face: four determine a homography, two more confirm it
@@ -265,43 +265,6 @@ def is_named(face: FaceDesign, circles: Iterable[int], target: TargetDesign) -> 
     """Returns whether the circles found name the face, as no other reading explains them all."""
     found = frozenset(circles)
     return not any(found <= rival for rival in confusable(face, target))
-
-
-def likeness_notes(target: TargetDesign) -> list[str]:
-    """Returns notes about faces that only one circle distinguishes, and mirror images; tags name themselves."""
-    target = target.with_faces(printed=False)
-    near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
-    notes = []
-    if near:
-        gap, face, other, circle = min(near)
-        faces = [each.id for each in target.faces if any(each.id in telling[1:3] for telling in near)]
-        rival = "the same face turned" if face == other else f"face {other}"
-        notes.append(
-            f"target {target.name}: face{'s' * (len(faces) > 1)} {', '.join(faces)}: one circle tells each from "
-            f"another, or from itself turned (the least is {face}:{circle} against {rival}, {gap:.1f} mm); where it is "
-            "hidden, the face has no name"
-        )
-    alike = mirror_images(target).items()
-    if pairs := {tuple(sorted((face, other))) for face, others in alike for other in others}:
-        listed = ", ".join(f"{a} of itself" if a == b else f"{a} and {b}" for a, b in sorted(pairs))
-        notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
-    return notes
-
-
-def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str, str]]:
-    """Returns single circles that distinguish a face from another one: distance in mm, both faces, and the circle."""
-    rival = other.xy_mm, other.radius_mm
-    telling = []
-    for common in common_circles(face.xy_mm, face.radius_mm, *rival, same=face is other):
-        if len(common) != len(face.ids) - 1:
-            continue
-        shared = np.array(sorted(common))
-        like = whole_likeness(face.xy_mm[shared], face.radius_mm[shared], *rival, shared if face is other else None)
-        if like is not None:
-            (alone,) = set(range(len(face.ids))) - common
-            gap = np.linalg.norm(like.moved(face.xy_mm[alone]) - other.xy_mm, axis=1).min()
-            telling.append((float(gap), face.id, other.id, face.ids[alone]))
-    return telling
 
 
 def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:

@@ -45,61 +45,40 @@ ZERO_COSINE = float(np.sin(np.radians(22.5)))
 MAX_MISFIT = 0.25  # largest distance of a circle from its place in the face's plane, in radii
 
 
+CIRCLES = [*"1234567abc"]
+LINES = ("2", "3"), ("4", "5"), ("6", "7")
+"""Large circles along X, Y and the diagonal from circle 1 on. Small are a and b, beside circle 1 in X and Y, and c,
+beside circle 7, whose direction names the face."""
+
+
 class PublishedPattern:
-    """Pattern of the published rules, by circle ids; an error if the design has another form."""
+    """Pattern of the published rules: sizes, and names of faces; an error if the design has another form."""
 
     def __init__(self, target: TargetDesign):
-        try:
-            self._read(target)
-        except (LookupError, ValueError) as error:
-            fault = f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error})"
-            form = (
-                "faces with large circles along X, Y and the diagonal, a small circle beside the origin on each axis, "
-            )
-            form += "and a small circle beside the last one of the diagonal, whose direction identifies the face"
-            remedy = f"--solve paper needs {form}; use joint or chain"
-            raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}; {remedy}") from error
+        if not (all(sorted(face.ids) == CIRCLES for face in target.faces) and self._read(target)):
+            fault = f"target {target.name}: its faces have not the circles 1 to 7, a, b and c of Zhang & Wei (2017)"
+            raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}, which --solve paper needs; use joint or chain")
 
-    def _read(self, target: TargetDesign) -> None:
-        first, places = target.faces[0], [dict(zip(face.ids, face.xy_mm, strict=True)) for face in target.faces]
-        place, radius = places[0], dict(zip(first.ids, first.radius_mm.tolist(), strict=True))
-        common = [i for i in first.ids if all(i in other and np.allclose(other[i], place[i]) for other in places)]
-        different = {tuple(circle for circle in face.ids if circle not in common) for face in target.faces}
-        if len(different) != 1 or len(names_face := different.pop()) != 1:
-            raise ValueError("not one circle alone differs from face to face")
-        largest = max(radius[circle] for circle in common)
-        large = {i: place[i] for i in common if radius[i] > 0.75 * largest and i != first.origin}
-        small = {i: place[i] for i in common if i not in large and i != first.origin}
-        lines = [_along(direction, large) for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
-        # ``origin`` of the directions, with the small circles ``a`` and ``b`` beside it
-        (self.a, step_x), (self.b, step_y) = (_along(direction, small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
-        self.origin = first.origin
-        if not np.isclose(step_x, step_y) or len(large) != sum(map(len, lines)) or len(small) != 2:
-            raise ValueError("its circles lie elsewhere")
-        (self.c,), self.last = names_face, lines[2][-1][0]  # small circle that names the face, and the one beside it
-        directions = [other[self.c] - place[self.last] for other in places]
-        # face id by (sign of the scalar, of the vector product) with the diagonal
-        self.names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
+    def _read(self, target: TargetDesign) -> bool:
+        """Reads sizes and names; returns whether the circles lie as published."""
+        first = target.faces[0]
+        radius = dict(zip(first.ids, first.radius_mm.tolist(), strict=True))
+        xy = np.array([face.places_mm(CIRCLES)[:, :2] for face in target.faces])
+        along, step = xy[0, 1:7].max(1), xy[0, 7, 0]  # of circles 2 to 7 from circle 1, and of a
+        ways = np.repeat([[1, 0], [0, 1], [1, 1]], 2, axis=0)
+        published = np.vstack([[0, 0], along[:, None] * ways, [step, 0], [0, step]])
+        directions = xy[:, 9] - xy[:, 6]
         distances = np.linalg.norm(directions, axis=1)
-        if len(self.names) < len(target.faces) or not np.allclose(distances, distances[0], rtol=0.05):
-            raise ValueError("the circles beside the last do not tell its faces apart")
-        # circles along X, Y and the diagonal from the origin on: (id, distance in steps)
-        self.lines = tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines)
-        self.step_radii = step_x / radius[first.origin]  # distance from the origin to ``a`` in radii of the origin
-        self.c_radii = float(distances[0]) / radius[self.last]
-        self.small = (radius[self.a] / radius[first.origin]) ** 2  # ratio of the areas of small and large circles
-
-
-def _along(direction: tuple[float, float], place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
-    """Returns the circles in a direction from the origin, nearest first, with distances in units of ``direction``."""
-    way = np.array(direction)
-    distances = {circle: float(xy @ way / (way @ way)) for circle, xy in place.items()}
-    aligned = [
-        (i, far) for i, far in distances.items() if far > 0 and np.allclose(place[i], far * way, atol=0.01 * far)
-    ]
-    if not aligned:
-        raise ValueError(f"no circle along ({direction[0]:g}, {direction[1]:g})")
-    return sorted(aligned, key=lambda each: each[1])
+        # circles along X, Y and the diagonal from circle 1 on: (id, distance in steps)
+        pairs = zip(LINES, (along / step).reshape(3, 2).tolist(), strict=True)
+        self.lines = [list(zip(circles, steps, strict=True)) for circles, steps in pairs]
+        self.step_radii = step / radius["1"]  # distance from circle 1 to a in radii of circle 1
+        self.c_radii = distances[0] / radius["7"]
+        self.small = (radius["a"] / radius["1"]) ** 2  # ratio of the areas of small and large circles
+        # face id by (sign of the scalar, of the vector product) of the direction of c with the diagonal
+        self.names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
+        is_told_apart = len(self.names) == len(target.faces) and np.allclose(distances, distances[0], rtol=0.05)
+        return is_told_apart and along.min() > step and np.allclose(xy[:, :9], published, atol=0.01 * step)
 
 
 def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
@@ -169,7 +148,7 @@ class _Rules:
                 continue
             if np.linalg.det(self.found.xy[beside] - self.found.xy[origin]) > 0:  # the image's y points down
                 beside.reverse()
-            circles = {self.pattern.origin: origin, self.pattern.a: beside[0], self.pattern.b: beside[1]}
+            circles = {"1": origin, "a": beside[0], "b": beside[1]}
             where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.centre_px[origin])
             named = self._walk(circles, free) or self._name(circles, free)
             if isinstance(named, str):
@@ -192,9 +171,9 @@ class _Rules:
 
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
         """Labels the large circles along the three directions; returns the reason if one is missing, else ""."""
-        origin = circles[self.pattern.origin]
+        origin = circles["1"]
         off = self.found.xy - self.found.xy[origin]
-        step_x, step_y = (off[circles[circle]] for circle in (self.pattern.a, self.pattern.b))
+        step_x, step_y = off[circles["a"]], off[circles["b"]]
         size = self.area / self.area[origin]
         large = free & (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
         large[origin] = False
@@ -215,11 +194,11 @@ class _Rules:
     def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceSighting, str]:
         """Returns the face named by circle c, and a note; or why there is none."""
         pattern = self.pattern
-        last = circles[pattern.last]
+        last = circles["7"]
         beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in circles.values()]
         if len(beside) != 1:
-            return f"{len(beside)} small circles beside circle {pattern.last}, 1 needed"
-        on_diagonal = self.found.xy[[circles[c] for c in (pattern.origin, *(c for c, _ in pattern.lines[2]))]]
+            return f"{len(beside)} small circles beside circle 7, 1 needed"
+        on_diagonal = self.found.xy[[circles[circle] for circle in "167"]]
         diagonal = _fitted_direction(on_diagonal, on_diagonal[-1] - on_diagonal[0])
         direction = self.found.xy[beside[0]] - self.found.xy[last]
         flip = np.array([1.0, -1.0])  # the image's y points down
@@ -227,9 +206,9 @@ class _Rules:
         placed = self._placed(circles, beside[0])
         if isinstance(placed, str):
             return placed
-        places = [face.xy_mm[face.ids.index(pattern.c)] for face in self.target.faces]
+        places = [face.xy_mm[face.ids.index("c")] for face in self.target.faces]
         face = self.target.faces[int(np.linalg.norm(places - placed, axis=1).argmin())]
-        rows = np.array([{**circles, pattern.c: beside[0]}[circle] for circle in face.ids])
+        rows = np.array([{**circles, "c": beside[0]}[circle] for circle in face.ids])
         sighting = FaceSighting(face.id, rows, np.arange(len(rows)))
         if published == face.id:
             return sighting, ""

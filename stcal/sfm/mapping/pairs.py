@@ -75,30 +75,13 @@ def rank_pairs(
         scores.remove(over[-1])
         return [replace(over[-1], verdict=f"chosen: the smallest {OVER_LIMIT}, none is under it"), *scores]
     if not scores or scores[0].verdict != "usable":
-        raise MappingError("E-MAPPING-NO-PAIR", _no_pair(group, scores, options))
+        why = "1 usable image, 2 needed"
+        if scores:
+            why = f"{scores[0].first}, {scores[0].second}: {scores[0].verdict}"
+        remedy = "photograph faces and board together, from different places with views in between; check that the "
+        remedy += "camera file belongs to the images, and that nothing but the camera moved; or raise --max-angle"
+        raise MappingError("E-MAPPING-NO-PAIR", f"group {group[0].group}: no initial pair, {why}; {remedy}")
     return [replace(scores[0], verdict="chosen"), *scores[1:]]
-
-
-def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
-    angle, shared = (max((getattr(s, name) for s in scores), default=0) for name in ("median_angle_rad", "shared"))
-    least, limit = (f"{np.degrees(each):.0f}°" for each in (MIN_ANGLE_RAD, options.limit_rad()))
-    wrong = "check that the camera file belongs to the images"
-    if not scores:
-        why = ": 1 usable image, 2 needed; add photographs from other places"
-    elif shared < MIN_LABELS:
-        why = f": at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
-    elif angle < MIN_ANGLE_RAD:
-        moved = f"largest median ray angle {np.degrees(angle):.2f}°, {least} needed"
-        why = f": the camera did not move ({moved}); take the photographs from different places"
-    elif behind := [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]:
-        best = max(behind, key=lambda s: s.in_front)
-        why = f": {best.first}, {best.second}: {best.verdict}; {wrong}, and that nothing but the camera moved"
-    else:
-        smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
-        measured = f"measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°"
-        remedy = f"add views in between, raise --max-angle, or {wrong}"
-        why = f" with a median ray angle of {least} to {limit} ({measured}); {remedy}"
-    return f"group {group[0].group}: no initial pair{why}"
 
 
 def _score(
@@ -198,7 +181,6 @@ SPARSE_FROM = 80
 MIN_SHARED = 6  # smallest number of common labels of a pair of images that is written
 SKELETON = 20  # number of images of a group that are mapped first. Smaller groups are mapped as a whole.
 MIN_VIEWS = 3  # smallest number of views of every circle in the skeleton, if the group has that many
-NEIGHBOURS = 3  # smallest number of skeleton images that each image outside the skeleton is paired with
 MIN_DOTS = 6
 
 
@@ -224,11 +206,9 @@ def image_graph(
     skeleton, joined = {}, np.zeros(shared.shape, bool)
     for name, indices in members.items():
         direction = np.array([_direction(observations[i], board) for i in indices])
-        chosen = _skeleton(direction, sees[indices])
-        skeleton[name] = indices[chosen]
-        among = np.ix_(indices[chosen], indices[chosen])
+        skeleton[name] = indices[_skeleton(direction, sees[indices])]
+        among = np.ix_(skeleton[name], skeleton[name])
         joined[among] = shared[among] >= MIN_SHARED
-        _join_neighbours(joined, indices, chosen, direction, sees, shared)
     _join_tracks(joined, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
     return ImageGraph(kind, np.argwhere(np.triu(joined, 1)), skeleton)
 
@@ -276,22 +256,6 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
         gain[chosen] = 0
         chosen.append(int(np.argmax(gain)))
     return np.sort(chosen)
-
-
-def _join_neighbours(joined: np.ndarray, indices, chosen, direction, seen, shared) -> None:
-    """Joins the group's other images with skeleton images: the nearest, and those their circles need."""
-    skeleton = indices[chosen]
-    for k in np.setdiff1d(np.arange(len(indices)), chosen):
-        i = indices[k]
-        near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
-        order = skeleton[np.argsort(-near, kind="stable")]
-        order = order[shared[i, order] >= MIN_SHARED]
-        picked = list(order[:NEIGHBOURS])
-        open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
-        while open_labels.any():
-            picked.append(max(order, key=lambda j: int((seen[j] & open_labels).sum())))
-            open_labels &= ~seen[picked[-1]]
-        joined[i, picked] = joined[picked, i] = True
 
 
 def _join_tracks(joined: np.ndarray, seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:

@@ -40,7 +40,7 @@ def test_errors_of_one_input_are_as_its_contribution_says(fixed, which):
     rows, source = rows_of(case, stated, which, DRAWS), source_of(stated, which)
     for k, row in enumerate(stated.budget.rows):
         error = np.array([each[k] for each in rows])
-        covariance = row.measurand.covariance(source, 0.0)
+        covariance = row.measurand.covariance(source)
         square = float(np.einsum("ni,ni->", error, np.linalg.solve(covariance, error.T).T))
         low, high = chi2.ppf([CHANCE, 1 - CHANCE], error.size) * [0.96, 1.04]
         assert low < square < high, (row.measurand.name, row.measurand.kind, square / error.size)

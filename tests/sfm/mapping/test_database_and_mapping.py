@@ -88,26 +88,22 @@ def test_board_dots_match_in_a_group_only_and_target_circles_everywhere(observed
     assert all(a.labels[i] == other.labels[j] for i, j in across)
 
 
-def map_one(scene, observed, database, tmp_path, group):
+def map_one(scene, observed, database, group):
     own = [o for o in observed if o.group == group]
     pairs = rank_pairs(own, scene.camera, PairOptions())
     ids = image_ids(observed)
-    return own, map_group(database, tmp_path / "scratch", own, list(ids), ids, pairs, scene.camera)
+    return own, map_group(database, own, list(ids), ids, pairs, scene.camera)
 
 
-def test_our_own_pose_is_registered_where_colmap_refuses_the_pair_or_no_model_is_named(
-    scene, observed, database, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("stcal.sfm.mapping.incremental.seeded_mapping", lambda *_: None)
-    own, mapping = map_one(scene, observed, database, tmp_path, "12")
+def test_all_images_are_mapped_from_the_pair_or_no_model_is_named(scene, observed, database, monkeypatch):
+    own, mapping = map_one(scene, observed, database, "12")
     assert set(mapping.model.images) == {o.name for o in own}
-    assert "our relative pose" in mapping.seeded
-    monkeypatch.setattr("stcal.sfm.mapping.incremental._own_mapping", lambda *_: None)
+    monkeypatch.setattr("stcal.sfm.mapping.incremental._mapped", lambda *_: None)
     with fails_with("E-MAPPING-NO-MODEL … 12"):
-        map_one(scene, observed, database, tmp_path, "12")
+        map_one(scene, observed, database, "12")
 
 
-def test_the_same_seed_gives_the_same_model(scene, observed, database, tmp_path):
-    _, a = map_one(scene, observed, database, tmp_path, "14")
-    _, b = map_one(scene, observed, database, tmp_path, "14")
+def test_the_same_seed_gives_the_same_model(scene, observed, database):
+    _, a = map_one(scene, observed, database, "14")
+    _, b = map_one(scene, observed, database, "14")
     np.testing.assert_array_equal(a.model.xyz_model, b.model.xyz_model)
