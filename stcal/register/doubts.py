@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.spatial.distance import pdist
-from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc, ndtr
 
 from stcal.errors import DegenerateError, InputError, StcalError
@@ -366,37 +364,6 @@ def check_supports(problem: Problem, inliers: np.ndarray, sigma_mm: float) -> No
         )
 
 
-SYMMETRY_UP_TO = 200
-"""Largest number of points checked for symmetry. Larger sets are clouds, not layouts with labels."""
-
-
-def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
-    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,), of
-    the smallest misfit. None if there is none, or points are too close together for the tolerance."""
-    n, centred = len(xyz), xyz - xyz.mean(0)
-    if not 3 <= n <= SYMMETRY_UP_TO or pdist(centred).min() < 4 * tolerance_mm:
-        return None
-    radius = np.linalg.norm(centred, axis=1)
-    first = int(radius.argmax())
-    second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
-    apart = np.linalg.norm(centred[:, None] - centred, axis=2)
-    near_first, near_second = (np.abs(radius - radius[i]) < 2 * tolerance_mm for i in (first, second))
-    fits = near_first[:, None] & near_second & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
-    fits[first, second] = False
-    tree, least, best = KDTree(centred), np.inf, None
-    for i, j in np.argwhere(fits):
-        turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
-        to = np.arange(n)
-        for _ in range(2):  # from two points, then from all: the first two carry their own noise
-            to = np.asarray(tree.query(centred @ turn.T)[1])
-            turn = best_rotations(centred[to].T @ centred)[0]
-        misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
-        is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
-        if is_one and misfit <= 2 * tolerance_mm and misfit < least:
-            least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
-    return best
-
-
 ASSUMED = (
     "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
     "sample, and the variance of their distances"
@@ -484,10 +451,3 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
     extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (problem.xyz_a, problem.xyz_b))
     if 0 < extent < SMALL_MM:
         yield f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m"
-    found = symmetry(inside, 4 * sigma if result.threshold_mm is None else result.threshold_mm)
-    if found is not None:
-        angle, to = found
-        moved = np.flatnonzero(to != np.arange(len(to)))
-        names = consensus.some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
-        like_it = f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names})"
-        yield f"{like_it}; labels exchanged like that would fit as well, so check that rows are the same points"

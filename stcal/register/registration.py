@@ -10,7 +10,6 @@ again. The limit for orthogonality and the number of samples are not stated; bot
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,7 @@ from scipy.special import chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments, require_fields, rms
-from stcal.geometry.rigid import Affine, Rigid, Similarity
+from stcal.geometry.rigid import Affine
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register import consensus, doubts
@@ -113,42 +112,6 @@ CONTRADICTED_AT = 0.01
 """Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 NEAREST_MM = 1e-9
 """Smallest threshold, mm: the precision of a double for points at a distance up to 1e12 mm."""
-
-
-class _Settings(TypedDict, total=False):
-    threshold_mm: float | None
-    weights: ArrayLike | None
-    covariances: ArrayLike | None
-    seed: int
-    folds: int
-    allow_ambiguous: bool
-    liu2017_options: Liu2017Options | None
-    lines: Sequence[int] | None
-
-
-Ours: TypeAlias = Literal["robust", "least-squares"]
-
-
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["rigid"] = ..., method: Ours = ..., **more: Unpack[_Settings]
-) -> Registration[Rigid]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["similarity"], method: Ours = ..., **more: Unpack[_Settings]
-) -> Registration[Similarity]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["affine"], method: str = ..., **more: Unpack[_Settings]
-) -> Registration[Affine]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: str = ..., method: Literal["liu2017"], **more: Unpack[_Settings]
-) -> Registration[Affine]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: str = ..., method: str = ..., **more: Unpack[_Settings]
-) -> Registration: ...
 
 
 @require_arguments

@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.consensus import MODELS, problem_of
-from stcal.register.doubts import WIDER_THAN, mirrored_ratio, moved_meanwhile, single_supports, spreads, symmetry
+from stcal.register.doubts import WIDER_THAN, mirrored_ratio, moved_meanwhile, single_supports, spreads
 from tests.outcome import refuses
 from tests.scripts import load_script
 from tests.support.point_pairs import B_FROM_A, scene
@@ -58,20 +58,6 @@ def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
     b = seen_of(a)
     b[20:] += np.random.default_rng(6).uniform(-60, 60, (4, 3))
     refuses("E-POINTS-COLLINEAR", register, a, b, folds=0)
-
-
-SQUARE = np.array([[100.0, 0, 0], [0, 100, 0], [-100, 0, 0], [0, -100, 0]])
-
-
-def test_a_symmetric_layout_is_told():
-    found = register(SQUARE, seen_of(SQUARE), folds=0)
-    [note] = [n for n in found.notes if "symmetric" in n]
-    assert "maps it onto itself (row" in note
-    # labels exchanged by such a turn fit as well
-    angle, to = symmetry(SQUARE, 0.5)
-    turned = register(SQUARE, seen_of(SQUARE)[to], folds=0)
-    assert turned.inlier_errors.rms_mm < 4 * SIGMA
-    assert np.degrees(angle) == pytest.approx(90, abs=1) or np.degrees(angle) == pytest.approx(180, abs=1)
 
 
 @pytest.mark.parametrize(("model", "width"), [("rigid", 0.4), ("affine", 0.6)])
