@@ -99,7 +99,6 @@ class Shifted:
     rows: np.ndarray
     count: int
     by_mm: np.ndarray
-    together: bool
 
 
 def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
@@ -125,7 +124,7 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
     if second.sum() > count / 2:
         second = ~second
     by_mm = plain[second].mean(0) - plain[~second].mean(0)
-    return Shifted(np.flatnonzero(second), count, by_mm, lies_together(problem.xyz_a, second))
+    return Shifted(np.flatnonzero(second), count, by_mm)
 
 
 Parted = tuple[float, np.ndarray, float]
@@ -258,18 +257,19 @@ SCALE_BY_CHANCE, MATTERS = 1e-4, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Wider:
-    """A wider model that explains the points: its ``transform``, σ of a coordinate with it, and the note."""
+class Explained:
+    """Points, the transform by the model that explains them, σ of a coordinate with it, and a note if that is a wider
+    model than was asked for."""
 
     problem: Problem
     transform: Transform
     sigma_mm: float
-    note: str
+    note: str = ""
 
 
-def wider(problem: Problem, transform: Transform) -> Wider | None:
-    """Returns the narrowest wider model that explains the points of ``transform`` better beyond chance, or None."""
-    narrow, transform_of, sigma = problem, transform, 0.0
+def explained(problem: Problem, transform: Transform, sigma_mm: float) -> Explained:
+    """Returns the points with the narrowest wider model that explains them better beyond chance, or as given."""
+    narrow, transform_of, sigma = problem, transform, sigma_mm
     for model in list(MODELS.values())[list(MODELS).index(problem.model.name) + 1 :]:
         candidate = replace(problem, model=model)
         try:
@@ -286,7 +286,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
         if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and decrease < 1 - MATTERS:
             narrow, transform_of, sigma = candidate, fitted, float(np.sqrt(max(after, 0) / redundancy))
     if narrow is problem:
-        return None
+        return Explained(problem, transform, sigma_mm)
     scales = np.linalg.svd(linear_part(transform_of), compute_uv=False)
     if narrow.model == AFFINE:
         said = (
@@ -302,7 +302,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
             "ppm/K), a length standard, a board or an instrument of another scale; correct one of the files, or use "
             "--model similarity"
         )
-    return Wider(narrow, transform_of, sigma, f"lengths in b are {said}")
+    return Explained(narrow, transform_of, sigma, f"lengths in b are {said}")
 
 
 WIDER_THAN = 10.0
@@ -372,32 +372,26 @@ SMALL_MM = 20.0
 """Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
 
 
-def notes_of(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> Iterator[str]:
-    """Yields all notes on a registration.
-
-    ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together.
-    """
-    inside, transform, sigma = problem[result.inliers], result.b_from_a, result.sigma_mm
-    if other is not None:
-        inside, transform, sigma = other.problem, other.transform, other.sigma_mm
+def notes_of(result: Registration, problem: Problem, found: Explained, shifted: Shifted | None) -> Iterator[str]:
+    """Yields all notes on a registration. ``found`` : its inliers; ``shifted`` : those that are shifted together."""
+    inside = found.problem
     yield from _on_agreement(result, problem)
-    if other is not None:
-        yield other.note
-    residuals = inside.residuals(transform)
+    if found.note:
+        yield found.note
+    residuals = inside.residuals(found.transform)
     if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
         yield (
             "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
             "other, and a transform is valid only where its points are; see the residual field"
         )
-    if other is None and result.method != "liu2017" and (change := moved_meanwhile(problem, transform)):
+    if not found.note and result.method != "liu2017" and (change := moved_meanwhile(problem, found.transform)):
         yield order_note(change, problem)
     if shifted is not None:
         by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
-        where = ", and lie together" if shifted.together else ""
         names = problem.names(np.flatnonzero(result.inliers)[shifted.rows])
         yield (
             f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-            f"{shifted.count - len(shifted.rows)}{where} ({names}): two groups, and the data do not show which is "
+            f"{shifted.count - len(shifted.rows)} ({names}): two groups, and the data do not show which is "
             "right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
         )
     if result.sigma_factor is not None and result.scaled:
@@ -408,7 +402,7 @@ def notes_of(result: Registration, problem: Problem, other: Wider | None, shifte
         yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
     if result.redundancy < 6:  # below, σ is known to 30 % at best
         yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
-    yield from _on_layout(result, problem, sigma)
+    yield from _on_layout(result, problem, found.sigma_mm)
 
 
 def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
