@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -382,24 +383,16 @@ def _require_different(ids: Sequence[str], what: str) -> None:
 
 def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
     """Refuses faces that look alike in photographs, and a face that looks the same after a rotation."""
-    for i, face in enumerate(faces):
-        for second in faces[i:]:
-            few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
-            in_place = np.arange(len(few.ids)) if few is many else None
-            like = whole_likeness(few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, in_place)
-            if like is None:
-                continue
-            size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
-            deviation = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
-            if few is many:
-                finding = f"face {face.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
-            elif len(few.ids) == len(many.ids):
-                finding = f"faces {face.id} and {second.id} have the same pattern{size}"
-            else:
-                finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
+    for face, second in combinations_with_replacement(faces, 2):
+        few, many = sorted((face, second), key=lambda each: len(each.ids))
+        in_place = np.arange(len(few.ids)) if few is many else None
+        like = whole_likeness(few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, in_place)
+        if like is not None:
+            as_on = f"are all on face {many.id} too, at {like.scale:.2f} times the size"
+            after = f"look the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
             by = f"its place by more than {MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
-            remedy = f"change a circle on {'it' if few is many else 'one of them'}, {by}"
-            raise InputError("E-TARGET-LIKENESS", f"{where}: {finding} ({deviation}); {remedy}")
+            fault = f"{where}: the circles of face {few.id} {after if few is many else as_on}"
+            raise InputError("E-TARGET-LIKENESS", f"{fault}; change one, {by}")
 
 
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:

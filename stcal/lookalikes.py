@@ -21,7 +21,6 @@ class Likeness:
     """Best motion of a whole pattern onto another one."""
 
     gap_mm: float  # largest distance of two centres, at the size of the other pattern
-    radius_mm: float  # largest difference of two radii, likewise
     turn_rad: float  # −π … π
     scale: float  # the other pattern's size over the pattern's own
     shift_mm: tuple[float, float]  # after rotation and scale
@@ -67,9 +66,8 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
         gap = abs(change * centred - target)
         coincides = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
         if coincides.all() and alike(scale * radius, other_radius).all():
-            radii_mm = float(abs(scale * radius - other_radius).max())
             shift = other.mean() - change * own.mean()
-            return Likeness(float(gap.max()), radii_mm, float(np.angle(change)), scale, (shift.real, shift.imag))
+            return Likeness(float(gap.max()), float(np.angle(change)), scale, (shift.real, shift.imag))
     return None
 
 

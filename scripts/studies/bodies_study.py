@@ -22,7 +22,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.sfm import RunOptions, pipeline
 from stcal.sfm.report.compare import FaceErrors, compare
-from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene
+from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.designs import second_design, tag_cube, tag_dodecahedron
 
 
@@ -59,7 +60,7 @@ def draw(name: str, seed: int) -> list[FaceErrors] | str:
     options = BodyOptions(images=images, distance_mm=distance_mm, seed=seed, print_errors=1.0)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        write_body(folder / "set", make_body_scene(target, body_camera(WIDTH), options), workers=1)
+        write_dataset(folder / "set", make_body_scene(target, body_camera(WIDTH), options), workers=1)
         try:
             own = folder / "set/images", None, folder / "run", folder / "set/target.toml"
             pipeline.run(*own, options=RunOptions(workers=1))

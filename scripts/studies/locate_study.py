@@ -45,7 +45,7 @@ SHEET_PER_MM, SHEET_MARGIN_MM = 6, 30.0
 def charuco_plan() -> LayoutPlan:
     """The board's tags as a target of unknown places."""
     tags = tuple((BOARD.dictionary, k) for k in range(TAGS))
-    return LayoutPlan("tags of a ChArUco", tags, np.full(TAGS, BOARD.marker_mm), ORIGIN, np.full((TAGS, 4, 2), np.nan))
+    return LayoutPlan("tags of a ChArUco", tags, ORIGIN, np.full((TAGS, 4, 2), np.nan))
 
 
 def charuco_images(folder: Path) -> CalibrationImages:

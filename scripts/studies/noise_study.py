@@ -66,7 +66,7 @@ def one_run(seed: int, point: Point) -> np.ndarray:
         for models, options in ((corrected, RunOptions()), (measured, RunOptions(eccentricity=False)))
     )
     scale = (ours.sigma_factors.circles * ours.joint.sigma_scale) ** 2
-    covariances = [c for face, c in ours.target.face_covariance.items() if face != scene.reference_face]
+    covariances = [c for face, c in ours.target.face_covariance.items() if face != ours.target.reference_face]
     bound = 1e6 * np.mean([np.trace(c[3:, 3:]) for c in covariances]) / scale
     return np.array([*squared_errors(ours, scene), bound, squared_errors(control, scene)[0]])
 

@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from itertools import compress, product
 from pathlib import Path
@@ -254,6 +255,7 @@ def _sheet(title: str, width: float, height: float, shapes: Iterable[Shape], shi
 
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
+_number = partial(said_mm, digits=6)  # in files
 CAPITAL_SHARE = 0.72  # height of a capital as a share of the font's size
 DASH = "3 1.5"
 
@@ -303,12 +305,9 @@ def _path(lines: Sequence[np.ndarray], height: float, closed: bool = True) -> st
     return " ".join(f"M{place}{' Z' if closed else ''}" for place in places)
 
 
-def _number(value: float) -> str:
-    """Return the text of a length to the nanometre, without trailing zeros."""
-    return f"{value:.6f}".rstrip("0").rstrip(".")
-
-
 POINT_MM = 25.4 / 72
+ARC_DEG = 45
+"""Length of the Bézier curves of a circle, which leave it by less than 5 parts in a million of its radius."""
 
 
 def pdf(sheets: Sequence[Sheet]) -> bytes:
@@ -345,15 +344,11 @@ def _add(canvas, shape: Shape) -> None:
         draw(0, 0, shape.words)
         canvas.restoreState()
     elif isinstance(shape, Disc):
-        arcs = 8  # leave the circle by less than 5 parts in a million of its radius
-        angle = np.arange(2 * arcs + 1) * np.pi / arcs
-        unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)[::2]
-        along = 4 / 3 * np.tan(np.pi / (2 * arcs)) * np.stack([-unit[:, 1], unit[:, 0]], axis=1)
-        ends, before, after = ([shape.x, shape.y] + shape.radius * at for at in (unit, unit - along, unit + along))
+        box = shape.box().ravel().tolist()
         path = canvas.beginPath()
-        path.moveTo(*ends[0].tolist())
-        for arc in zip(after[:-1], before[1:], ends[1:], strict=True):
-            path.curveTo(*np.concatenate(arc).tolist())
+        path.arc(*box, startAng=0, extent=ARC_DEG)
+        for start in range(ARC_DEG, 360, ARC_DEG):
+            path.arcTo(*box, startAng=start, extent=ARC_DEG)
         path.close()
         canvas.drawPath(path, stroke=0, fill=1)
     elif not shape.width:
@@ -506,11 +501,5 @@ def drawn_text(drawn: Drawn) -> str:
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         lines.append(f"sheets without dimensions, which would take more sheets: {bare} of {sheets}")
     if drawn.paper != OWN and sheets > len(drawn.parts):
-        whole = paper_for(drawn.parts)
-        larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
-        room = _size(PAPERS[drawn.paper] - FURNITURE)
-        lines.append(
-            f"a sheet of {drawn.paper} has room for {room}, either way round, dimensions included; parts that are "
-            f"glued of several sheets are off at the seams: state it in sigma_mm, or {larger}"
-        )
+        lines.append("parts glued of several sheets are off at the seams: state it in sigma_mm, or take larger paper")
     return "\n".join(lines)

@@ -308,21 +308,19 @@ def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = Fal
     with np.errstate(all="ignore"):
         scale = np.sqrt(np.maximum(variance, TINY))
         scales = scale[:, :, None] * scale[:, None, :]
-        correlation = matrices / scales
-        correlation[:, range(size), range(size)] = variance / scale**2
+        correlation = (matrices + np.diag(nothing)) / scales
         odd = np.abs(matrices - np.swapaxes(matrices, 1, 2)) - np.sqrt(np.outer(nothing, nothing))
         odd /= scales
-        acceptable = (variance >= 0).all(axis=1) & (variance <= LARGEST).all(axis=1)
-        acceptable &= (odd <= ROUNDING * size).all(axis=(1, 2))
-        acceptable &= (np.abs(correlation) <= 1 + ROUNDING * size).all(axis=(1, 2))
+        usable = (variance >= 0) & (variance <= LARGEST) & (odd <= ROUNDING * size).all(axis=2)
+    usable = usable.all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))
     lowest = np.full(len(matrices), -np.inf)
-    lowest[acceptable] = np.linalg.eigvalsh(correlation[acceptable])[:, 0]
+    lowest[usable] = np.linalg.eigvalsh(correlation[usable])[:, 0]
     bad = np.flatnonzero(~(lowest > 0 if definite else lowest >= -ROUNDING * size))
     if not len(bad):
         return None
     row = int(bad[0])
     suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    return Fault(row, _reason(matrices[row], odd[row], correlation[row], float(lowest[row]), rows, definite) + suffix)
+    return Fault(row, _reason(matrices[row], variance[row], odd[row], float(lowest[row]), rows, definite) + suffix)
 
 
 def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, definite: bool = False) -> None:
@@ -334,23 +332,17 @@ def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, defi
         raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 
-def _reason(matrix, odd, correlation, lowest: float, rows: CovarianceRows, definite: bool) -> str:
+def _reason(matrix, variance, odd, lowest: float, rows: CovarianceRows, definite: bool) -> str:
     """Return why one matrix is not a covariance; ``odd`` : asymmetry of its correlations."""
-    variance, needed = np.diagonal(matrix), "a positive number" if definite else "0 or more"
+    needed, below = "a positive number" if definite else "0 or more", variance <= 0 if definite else variance < 0
     if not np.isfinite(matrix).all():
         return "a value is not finite, finite numbers needed"
-    below = variance <= 0 if definite else np.diagonal(correlation) < 0
     if below.any() or variance.max() > LARGEST:
         k = int(np.argmax(below if below.any() else variance))
         needed = needed if below.any() else f"up to {LARGEST:g}"
-        return f"variance {variance[k]:.3g} of {rows.names[k]}, {needed} needed"
+        return f"variance {matrix[k, k]:.3g} of {rows.names[k]}, {needed} needed"
     if odd.max() > ROUNDING * len(matrix):
         i, j = np.unravel_index(int(np.argmax(odd)), odd.shape)
         share = abs(matrix[i, j] - matrix[j, i]) / max(abs(matrix[i, j]), abs(matrix[j, i]))
         return f"not symmetric by {round(100 * share, 1):g} % at {rows.names[i]}, {rows.names[j]}"
-    off = np.abs(correlation - np.diag(np.diagonal(correlation)))
-    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
-    if off[i, j] > 1 + ROUNDING * len(matrix):
-        named = f"{rows.names[i]} and {rows.names[j]}"
-        return f"correlation {correlation[i, j]:.3g} of {named}, −1 to 1 needed"
     return f"its correlations have the eigenvalue {lowest:.3g}, {needed} needed"

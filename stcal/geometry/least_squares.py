@@ -201,12 +201,6 @@ class Minima:
         """Return the minima by their costs."""
         return self.rows(np.argsort(self.cost, kind="stable"))
 
-    def plus(self, other: "Minima") -> "Minima":
-        """Return these minima followed by those of ``other``."""
-        names = ("cost", "normal", "length", "settled")
-        both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
-        return Minima(self.poses + other.poses, *both)
-
 
 def descend(evaluate: Callable[[Poses], Normal], poses: Poses, settled: float, hopeless: float = np.inf) -> Minima:
     """Return the minima reached from h poses at once; a step that lowers χ² by less than ``settled``, or by less than

@@ -231,8 +231,8 @@ def two_minima(
         raise ConvergenceError("E-NO-MINIMUM", failure)
     is_double = distinct(minima.poses, minima.normal[0], sigma)
     if planar and not is_double:
-        again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
-        minima = minima.rows([0]).plus(again).ordered()
+        best = minima.poses[[0]]
+        minima = descend(best + mirrored(best, target_from_plane), HUBER * sigma).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
     return minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), OUTLIER * sigma
 

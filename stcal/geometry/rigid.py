@@ -345,22 +345,8 @@ class Affine(ByValue):
         m[:3, :3], m[:3, 3] = self.linear, self.translation
         return m
 
-    def inverse(self) -> "Affine":
-        """Return b_from_a; a singular linear part is refused."""
-        if np.linalg.cond(self.linear) > 1e12:
-            fault = "affine transform: 3×3 part is singular"
-            raise DegenerateError("E-AFFINE-SINGULAR", f"{fault}; an invertible one needed")
-        back = np.linalg.inv(self.linear)
-        return Affine(back, -back @ self.translation)
-
-    @overload
-    def __matmul__(self, other: "Affine") -> "Affine": ...
-    @overload
-    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
-    def __matmul__(self, other):
-        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
-        if isinstance(other, Affine):
-            return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
+    def __matmul__(self, other: ArrayLike) -> np.ndarray:
+        """Return points in frame a for points (..., 3) in frame b, mm."""
         return np.asarray(other, float) @ self.linear.T + self.translation
 
 

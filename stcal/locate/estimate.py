@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
@@ -42,17 +41,17 @@ class PlanarProblem:
 
     xy: np.ndarray  # (n, 2) in {obj}, mm
     seen: np.ndarray  # (n, 2)
-    noise: np.ndarray  # (2n, 2n) covariance of ``seen``
+    noise: np.ndarray  # (2n, 2n) covariance of ``seen``, tag by tag
     px_by_seen: np.ndarray  # (n, 2, 2) jacobian of the lens
     shape: np.ndarray  # (2n, 2n) covariance of ``xy``
-    common: np.ndarray  # (n, 2, q) of ``seen`` by what corners share: shifts of edges and tags, inexact intrinsics
-    prior: np.ndarray  # (q, q) covariance of what they share
+    intrinsics: np.ndarray  # (2n, 2n) covariance of ``seen`` due to those of the camera
 
     def select(self, keep: np.ndarray) -> "PlanarProblem":
         """Returns the selected corners."""
         rows = (2 * keep[:, None] + np.arange(2)).ravel()
-        points = (self.xy[keep], self.seen[keep], self.noise[np.ix_(rows, rows)], self.px_by_seen[keep])
-        return PlanarProblem(*points, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
+        at = np.ix_(rows, rows)
+        points = self.xy[keep], self.seen[keep], self.noise[at], self.px_by_seen[keep]
+        return PlanarProblem(*points, self.shape[at], self.intrinsics[at])
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
         """Returns the residuals (n, 2) in the image with distortion, px."""
@@ -79,15 +78,14 @@ def project(problem: PlanarProblem, poses: Poses) -> ProjectedCorners:
 
 
 def descent_near(problem: PlanarProblem, pose: Poses) -> Descend:
-    """Returns the descent with residuals of single corners whitened near a pose by noise, shared and layout errors."""
+    """Returns the descent with residuals of single corners whitened near a pose by noise and layout errors."""
     by_corner = project(problem, pose).by_corner[0]
     n = len(problem.xy)
-    noise, shape_of_corner = (
-        matrix.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)] for matrix in (problem.noise, problem.shape)
+    seen, shape = (
+        matrix.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+        for matrix in (problem.noise + problem.intrinsics, problem.shape)
     )
-    shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
-    full = noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
-    whiten = np.linalg.inv(np.linalg.cholesky(full))
+    whiten = np.linalg.inv(np.linalg.cholesky(seen + by_corner @ shape @ np.swapaxes(by_corner, 1, 2)))
 
     def descend(poses: Poses, huber: float) -> Minima:
         def evaluate(poses: Poses) -> Normal:
@@ -100,11 +98,9 @@ def descent_near(problem: PlanarProblem, pose: Poses) -> Descend:
 
 
 def weighed(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
-    """Estimates a pose by image noise over Huber's ``weights`` (n,), shared errors, and the layout's covariance."""
+    """Estimates a pose by image noise over Huber's ``weights`` (n,), and the covariances of camera and layout."""
     root = np.repeat(np.sqrt(weights), 2)
-    noise = problem.noise / (root[:, None] * root)
-    common = problem.common.reshape(2 * len(problem.xy), -1)
-    noise += common @ problem.prior @ common.T
+    noise = problem.noise / (root[:, None] * root) + problem.intrinsics
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
     full = (noise + by_corner @ problem.shape @ by_corner.T)[None]
 
@@ -249,22 +245,19 @@ def problem_of(
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.pixel_jacobian(ideal)
     seen_by_px = np.linalg.inv(px_by_seen)
-    k, tag = len(detected), np.arange(len(detected))
-    by_shift = np.zeros((k, 4, 2, 3, k))  # px, by the shift of a tag's edges, and of a whole tag along x and y
-    by_shift[tag, :, :, 0, tag] = corners_by_edges(detected.corners_px)
-    by_shift[tag, :, :, 1:, tag] = np.eye(2)
-    common = seen_by_px @ by_shift.reshape(4 * k, 2, 3 * k)
-    common_covariance = np.diag([*detected.edge_sigma_px**2, *np.full(2 * k, layout.tag_sigma_px**2)])
+    # A tag's corners err as measured, by the edges' common shift, and by a shift of the whole tag.
+    direction, whole = corners_by_edges(detected.corners_px).reshape(-1, 8), np.tile(np.eye(2), (4, 1))
+    edges = detected.edge_sigma_px[:, None, None] ** 2 * direction[:, :, None] * direction[:, None]
+    of_tag = detected.covariance_px2 + edges + layout.tag_sigma_px**2 * whole @ whole.T
+    in_seen = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
+    noise = block_diagonal(in_seen @ of_tag @ np.swapaxes(in_seen, 1, 2))
+    intrinsics = np.zeros_like(noise)
     if prior is not None:
         by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        common = np.concatenate([common, by_camera], axis=2)
-        common_covariance = np.asarray(block_diag(common_covariance, prior.covariance))
-    of_tags = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
-    noise = block_diagonal(of_tags @ detected.covariance_px2 @ np.swapaxes(of_tags, 1, 2))
-    xy = layout.corners_mm[detected.rows].reshape(-1, 2)
-    return PlanarProblem(
-        xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
-    )
+        flat = by_camera.reshape(len(noise), -1)
+        intrinsics = flat @ prior.covariance @ flat.T
+    xy, shape = layout.corners_mm[detected.rows].reshape(-1, 2), layout.covariance_mm2[np.ix_(rows, rows)]
+    return PlanarProblem(xy, ideal, noise, px_by_seen, shape, intrinsics)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:

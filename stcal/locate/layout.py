@@ -24,15 +24,13 @@ WRITTEN_MM = 1e-6  # largest difference of a written corner, mm: its last decima
 class LayoutPlan(Brief):
     """Nominal target, for its calibration.
 
-    ``name`` : name of the target; ``tags`` : dictionary and id of the n tags; ``size_mm`` : (n,) side lengths, NaN if
-    not given; ``origin`` : row of the tag whose centre is the origin of {obj}; ``corners_mm`` : (n, 4, 2) nominal
-    corners in the plane of the target, NaN if a place is not given; ``unusual_size`` : true if unusually long or short
-    sides are not a mistake of units.
+    ``name`` : name of the target; ``tags`` : dictionary and id of the n tags; ``origin`` : row of the tag whose centre
+    is the origin of {obj}; ``corners_mm`` : (n, 4, 2) nominal corners in the plane of the target, NaN if a place is not
+    given; ``unusual_size`` : true if unusually long or short sides are not a mistake of units.
     """
 
     name: str
     tags: tuple[tuple[str, int], ...]
-    size_mm: np.ndarray
     origin: int
     corners_mm: np.ndarray
     unusual_size: bool = False
@@ -40,9 +38,8 @@ class LayoutPlan(Brief):
     def __post_init__(self):
         require_fields(self, "target layout", origin=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
-        for name, shape in (("size_mm", ()), ("corners_mm", (4, 2))):
-            values = frozen(getattr(self, name), (len(self.tags), *shape), f"target layout: {name}", finite=False)
-            object.__setattr__(self, name, values)
+        corners = frozen(self.corners_mm, (len(self.tags), 4, 2), "target layout: corners_mm", finite=False)
+        object.__setattr__(self, "corners_mm", corners)
         require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
 
@@ -171,9 +168,8 @@ def _plan(data: TagsFile, where: str, every: bool = False) -> LayoutPlan:
         fault = f"{where}: origin {origin}: no tag has this id"
         raise InputError("E-LAYOUT-ORIGIN", f"{fault}; one of {', '.join(map(str, ids))} needed")
     corners = placed_corners(data, where, every)
-    size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
-    return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)
+    return LayoutPlan(data.name, tags, ids.index(origin), corners, data.unusual_size)
 
 
 def in_obj(corners: np.ndarray, origin: int) -> np.ndarray:

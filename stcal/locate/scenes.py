@@ -72,15 +72,6 @@ class Exposure:
     size: tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneTags:
-    """The readable exposures of one scene; ``unreadable`` : why others could not be read."""
-
-    name: str
-    exposures: tuple[Exposure, ...]
-    unreadable: tuple[str, ...] = ()
-
-
 CAPTURED = "capture.json"
 """Name of the file that ``capture`` writes beside the images of a scene."""
 
@@ -118,23 +109,6 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
         name = real_place(path).name if group == TOP_GROUP else group
         scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
     return scenes
-
-
-def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int | None = None) -> Iterator[SceneTags]:
-    """Yields the tags of each scene. Each image is decoded once, while other threads search earlier images for tags."""
-    dictionaries = layout.dictionaries()
-    with ThreadPoolExecutor(workers) as pool:
-        for scene in scenes:
-            pending, unreadable = [], []
-            for file in scene.files:
-                # Decoding stays in this thread, because it captures what the decoders write to standard error.
-                try:
-                    image = grey_8bit(decode(file.read(), file.name))
-                except (InputError, OSError) as error:
-                    unreadable.append(" ".join(str(error).split()))
-                else:
-                    pending.append(pool.submit(detect, image, file.name, dictionaries))
-            yield SceneTags(scene.name, tuple(each.result() for each in pending), tuple(unreadable))
 
 
 def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
@@ -269,27 +243,19 @@ class LocateOptions:
 class Located(Brief):
     """Result of one scene.
 
-    ``tags`` : that its exposures show; ``merged`` : their corners, None if the exposures do not belong together;
-    ``pose`` : by the joint method, None if it failed or another was asked for; ``verdict`` : whether the pose may be
-    used; ``notes`` : what was left out, and others; ``patent`` : result of the patent's method, if asked for.
+    ``name`` : of the scene; ``exposures`` : its readable ones; ``merged`` : their corners, None if the exposures do not
+    belong together; ``pose`` : by the joint method, None if it failed or another was asked for; ``verdict`` : whether
+    the pose may be used; ``notes`` : what was left out, and others; ``patent`` : result of the patent's method, if
+    asked for.
     """
 
-    tags: SceneTags
+    name: str
+    exposures: tuple[Exposure, ...]
     merged: Merged | None
     pose: ObjPose | None
     verdict: Verdict
     notes: tuple[str, ...] = ()
     patent: PatentPose | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the scene."""
-        return self.tags.name
-
-    @property
-    def exposures(self) -> tuple[Exposure, ...]:
-        """Readable exposures of the scene."""
-        return self.tags.exposures
 
     @property
     def camera_from_obj(self) -> Rigid | None:
@@ -321,9 +287,24 @@ def run(
     """
     options, model = options or LocateOptions(), camera_model(camera)
     layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
-    for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        by_name = {file.name: file for file in files.files}
-        yield locate_scene(tags, layout, model, options, lambda name, own=by_name: decode(own[name].read(), name))
+    dictionaries = layout.dictionaries()
+    with ThreadPoolExecutor(options.workers) as pool:  # threads search earlier images for tags meanwhile
+        for scene in scenes:
+            by_name, pending, notes = {file.name: file for file in scene.files}, [], []
+            for file in scene.files:
+                # Decoding stays in this thread, because it captures what the decoders write to standard error.
+                try:
+                    image = grey_8bit(decode(file.read(), file.name))
+                except (InputError, OSError) as error:
+                    notes.append(f"left out: {' '.join(str(error).split())}")
+                else:
+                    pending.append(pool.submit(detect, image, file.name, dictionaries))
+
+            def image_of(name: str, by_name=by_name) -> np.ndarray:
+                return decode(by_name[name].read(), name)
+
+            exposures = tuple(each.result() for each in pending)
+            yield locate_scene(scene.name, exposures, layout, model, options, image_of, notes)
 
 
 @require_arguments
@@ -358,22 +339,24 @@ def locate_image(
     if size != wanted:
         raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
     exposure = detect(grey_8bit(grey), name, target.dictionaries())
-    return locate_scene(SceneTags(name, (exposure,)), target, model, options or LocateOptions(), lambda _: grey)
+    return locate_scene(name, (exposure,), target, model, options or LocateOptions(), lambda _: grey)
 
 
 def locate_scene(
-    scene: SceneTags,
+    name: str,
+    used: tuple[Exposure, ...],
     layout: TargetLayout,
     camera: CameraModel,
     options: LocateOptions,
     image_of: Callable[[str], np.ndarray],
+    trouble: Sequence[str] = (),
 ) -> Located:
-    """Locates the target in one scene and judges the pose; in an image without its tags, others are looked for."""
-    used, notes = scene.exposures, [f"left out: {trouble}" for trouble in scene.unreadable]
-    merged = None
+    """Locates the target in one scene by its exposures and judges the pose; ``trouble`` : notes so far. In an image
+    without its tags, others are looked for."""
+    notes, merged = [*trouble], None
 
     def rejected(*reasons: str) -> Located:
-        return Located(scene, merged, None, Verdict("reject", (), reasons), tuple(notes))
+        return Located(name, used, merged, None, Verdict("reject", (), reasons), tuple(notes))
 
     if not used:
         return rejected("no readable image; 1 needed")
@@ -426,11 +409,11 @@ def locate_scene(
         straight = corners - shift_by_curves(corners, sized)
         merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
         if options.method == "patent":
-            found = locate_as_patent([e.tags for e in used], layout, sized, options.patent, scene.name)
-            return Located(scene, merged, None, found.verdict, tuple(notes), found)
-        pose = locate(merged.seen, layout, sized, prior, scene.name)
+            found = locate_as_patent([e.tags for e in used], layout, sized, options.patent, name)
+            return Located(name, used, merged, None, found.verdict, tuple(notes), found)
+        pose = locate(merged.seen, layout, sized, prior, name)
     except StcalError as error:
-        return rejected(str(error).removeprefix(f"{scene.name}: "), *mistakes(merged.seen, None))
+        return rejected(str(error).removeprefix(f"{name}: "), *mistakes(merged.seen, None))
     if pose.outliers:
         ids = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
         notes.append(f"tags that contradict the others, left out: {ids}")
@@ -438,4 +421,4 @@ def locate_scene(
     doubtful = pose.outliers or verdict.decision == "reject"
     if doubtful and (explained := mistakes(merged.seen, pose)):
         verdict = replace(verdict, decision="reject", reasons=(*verdict.reasons, *explained))
-    return Located(scene, merged, pose, verdict, tuple(notes))
+    return Located(name, used, merged, pose, verdict, tuple(notes))

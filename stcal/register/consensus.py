@@ -83,12 +83,6 @@ def rotation_of(transform: Transform) -> np.ndarray:
     return best_rotations(linear_part(transform))[0]
 
 
-def some_of(items: Sequence | np.ndarray, say: Callable[[Any], str]) -> str:
-    """Returns the first of some items in words, and the number of others."""
-    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
-    return ", ".join(say(item) for item in items[:SHOWN]) + more
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Point pairs (n, 3) mm of a model, neither copied nor checked, as subsets are taken in inner loops.
@@ -117,7 +111,8 @@ class Problem:
 
     def names(self, rows: np.ndarray) -> str:
         """Returns the names of the first of some points, and the number of others."""
-        return some_of(rows, self.name)
+        more = f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else ""
+        return ", ".join(map(self.name, rows[:SHOWN])) + more
 
     @property
     def redundancy(self) -> int:

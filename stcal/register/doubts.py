@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.spatial.distance import pdist
-from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc, ndtr
 
 from stcal.errors import DegenerateError, InputError, StcalError
@@ -101,7 +99,6 @@ class Shifted:
     rows: np.ndarray
     count: int
     by_mm: np.ndarray
-    together: bool
 
 
 def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
@@ -127,7 +124,7 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
     if second.sum() > count / 2:
         second = ~second
     by_mm = plain[second].mean(0) - plain[~second].mean(0)
-    return Shifted(np.flatnonzero(second), count, by_mm, lies_together(problem.xyz_a, second))
+    return Shifted(np.flatnonzero(second), count, by_mm)
 
 
 Parted = tuple[float, np.ndarray, float]
@@ -260,18 +257,19 @@ SCALE_BY_CHANCE, MATTERS = 1e-4, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Wider:
-    """A wider model that explains the points: its ``transform``, σ of a coordinate with it, and the note."""
+class Explained:
+    """Points, the transform by the model that explains them, σ of a coordinate with it, and a note if that is a wider
+    model than was asked for."""
 
     problem: Problem
     transform: Transform
     sigma_mm: float
-    note: str
+    note: str = ""
 
 
-def wider(problem: Problem, transform: Transform) -> Wider | None:
-    """Returns the narrowest wider model that explains the points of ``transform`` better beyond chance, or None."""
-    narrow, transform_of, sigma = problem, transform, 0.0
+def explained(problem: Problem, transform: Transform, sigma_mm: float) -> Explained:
+    """Returns the points with the narrowest wider model that explains them better beyond chance, or as given."""
+    narrow, transform_of, sigma = problem, transform, sigma_mm
     for model in list(MODELS.values())[list(MODELS).index(problem.model.name) + 1 :]:
         candidate = replace(problem, model=model)
         try:
@@ -288,7 +286,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
         if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and decrease < 1 - MATTERS:
             narrow, transform_of, sigma = candidate, fitted, float(np.sqrt(max(after, 0) / redundancy))
     if narrow is problem:
-        return None
+        return Explained(problem, transform, sigma_mm)
     scales = np.linalg.svd(linear_part(transform_of), compute_uv=False)
     if narrow.model == AFFINE:
         said = (
@@ -304,7 +302,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
             "ppm/K), a length standard, a board or an instrument of another scale; correct one of the files, or use "
             "--model similarity"
         )
-    return Wider(narrow, transform_of, sigma, f"lengths in b are {said}")
+    return Explained(narrow, transform_of, sigma, f"lengths in b are {said}")
 
 
 WIDER_THAN = 10.0
@@ -366,37 +364,6 @@ def check_supports(problem: Problem, inliers: np.ndarray, sigma_mm: float) -> No
         )
 
 
-SYMMETRY_UP_TO = 200
-"""Largest number of points checked for symmetry. Larger sets are clouds, not layouts with labels."""
-
-
-def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
-    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,), of
-    the smallest misfit. None if there is none, or points are too close together for the tolerance."""
-    n, centred = len(xyz), xyz - xyz.mean(0)
-    if not 3 <= n <= SYMMETRY_UP_TO or pdist(centred).min() < 4 * tolerance_mm:
-        return None
-    radius = np.linalg.norm(centred, axis=1)
-    first = int(radius.argmax())
-    second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
-    apart = np.linalg.norm(centred[:, None] - centred, axis=2)
-    near_first, near_second = (np.abs(radius - radius[i]) < 2 * tolerance_mm for i in (first, second))
-    fits = near_first[:, None] & near_second & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
-    fits[first, second] = False
-    tree, least, best = KDTree(centred), np.inf, None
-    for i, j in np.argwhere(fits):
-        turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
-        to = np.arange(n)
-        for _ in range(2):  # from two points, then from all: the first two carry their own noise
-            to = np.asarray(tree.query(centred @ turn.T)[1])
-            turn = best_rotations(centred[to].T @ centred)[0]
-        misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
-        is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
-        if is_one and misfit <= 2 * tolerance_mm and misfit < least:
-            least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
-    return best
-
-
 ASSUMED = (
     "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
     "sample, and the variance of their distances"
@@ -405,32 +372,26 @@ SMALL_MM = 20.0
 """Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
 
 
-def notes_of(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> Iterator[str]:
-    """Yields all notes on a registration.
-
-    ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together.
-    """
-    inside, transform, sigma = problem[result.inliers], result.b_from_a, result.sigma_mm
-    if other is not None:
-        inside, transform, sigma = other.problem, other.transform, other.sigma_mm
+def notes_of(result: Registration, problem: Problem, found: Explained, shifted: Shifted | None) -> Iterator[str]:
+    """Yields all notes on a registration. ``found`` : its inliers; ``shifted`` : those that are shifted together."""
+    inside = found.problem
     yield from _on_agreement(result, problem)
-    if other is not None:
-        yield other.note
-    residuals = inside.residuals(transform)
+    if found.note:
+        yield found.note
+    residuals = inside.residuals(found.transform)
     if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
         yield (
             "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
             "other, and a transform is valid only where its points are; see the residual field"
         )
-    if other is None and result.method != "liu2017" and (change := moved_meanwhile(problem, transform)):
+    if not found.note and result.method != "liu2017" and (change := moved_meanwhile(problem, found.transform)):
         yield order_note(change, problem)
     if shifted is not None:
         by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
-        where = ", and lie together" if shifted.together else ""
         names = problem.names(np.flatnonzero(result.inliers)[shifted.rows])
         yield (
             f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-            f"{shifted.count - len(shifted.rows)}{where} ({names}): two groups, and the data do not show which is "
+            f"{shifted.count - len(shifted.rows)} ({names}): two groups, and the data do not show which is "
             "right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
         )
     if result.sigma_factor is not None and result.scaled:
@@ -441,7 +402,7 @@ def notes_of(result: Registration, problem: Problem, other: Wider | None, shifte
         yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
     if result.redundancy < 6:  # below, σ is known to 30 % at best
         yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
-    yield from _on_layout(result, problem, sigma)
+    yield from _on_layout(result, problem, found.sigma_mm)
 
 
 def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
@@ -484,10 +445,3 @@ def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator
     extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (problem.xyz_a, problem.xyz_b))
     if 0 < extent < SMALL_MM:
         yield f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m"
-    found = symmetry(inside, 4 * sigma if result.threshold_mm is None else result.threshold_mm)
-    if found is not None:
-        angle, to = found
-        moved = np.flatnonzero(to != np.arange(len(to)))
-        names = consensus.some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
-        like_it = f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names})"
-        yield f"{like_it}; labels exchanged like that would fit as well, so check that rows are the same points"

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic
 
 import numpy as np
 
@@ -14,15 +13,6 @@ from stcal.geometry.arrays import OF_POINT, Array, Brief, ByValue, freeze, requi
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
 from stcal.register.consensus import Problem, Transform, linear_part
-
-if TYPE_CHECKING:
-    from typing_extensions import TypeVar
-
-    T = TypeVar("T", bound=Transform, default=Transform)
-else:
-    from typing import TypeVar
-
-    T = TypeVar("T")
 
 WHAT = "point pairs"
 COVARIANCE = tuple(f"cov_{a}_{b}" for a, b in combinations_with_replacement(OF_POINT.names, 2))
@@ -181,7 +171,7 @@ class Alternative(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Registration(Brief, Generic[T]):
+class Registration(Brief):
     """The transform between two instruments' frames.
 
     Parameters
@@ -210,7 +200,7 @@ class Registration(Brief, Generic[T]):
 
     model: str
     method: str
-    b_from_a: T
+    b_from_a: Transform
     covariance: Array
     inliers: Array
     residuals: Array

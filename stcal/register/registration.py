@@ -10,7 +10,6 @@ again. The limit for orthogonality and the number of samples are not stated; bot
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,7 @@ from scipy.special import chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments, require_fields, rms
-from stcal.geometry.rigid import Affine, Rigid, Similarity
+from stcal.geometry.rigid import Affine
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register import consensus, doubts
@@ -50,14 +49,14 @@ class Liu2017Options:
 
     def __post_init__(self):
         require_fields(self, "liu2017")
-        checks = {"sample": (self.sample >= 4, "4 or more points for twelve parameters")}
-        checks["share"] = (0 < self.share <= 1, "more than 0 and at most 1")
-        checks |= {
-            name: (getattr(self, name) > 0, "a positive number") for name in self.__slots__ if name not in checks
-        }
-        for name, (fits, words) in checks.items():
+        positive = "limit_mm", "orthogonal_within", "tries"
+        for name, fits, needed in (
+            ("sample", self.sample >= 4, "4 or more points for twelve parameters"),
+            ("share", 0 < self.share <= 1, "more than 0 and at most 1"),
+            *((name, getattr(self, name) > 0, "a positive number") for name in positive),
+        ):
             if not fits:
-                raise InputError("E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; {words} needed")
+                raise InputError("E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; {needed} needed")
 
 
 def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
@@ -113,42 +112,6 @@ CONTRADICTED_AT = 0.01
 """Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 NEAREST_MM = 1e-9
 """Smallest threshold, mm: the precision of a double for points at a distance up to 1e12 mm."""
-
-
-class _Settings(TypedDict, total=False):
-    threshold_mm: float | None
-    weights: ArrayLike | None
-    covariances: ArrayLike | None
-    seed: int
-    folds: int
-    allow_ambiguous: bool
-    liu2017_options: Liu2017Options | None
-    lines: Sequence[int] | None
-
-
-Ours: TypeAlias = Literal["robust", "least-squares"]
-
-
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["rigid"] = ..., method: Ours = ..., **more: Unpack[_Settings]
-) -> Registration[Rigid]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["similarity"], method: Ours = ..., **more: Unpack[_Settings]
-) -> Registration[Similarity]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: Literal["affine"], method: str = ..., **more: Unpack[_Settings]
-) -> Registration[Affine]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: str = ..., method: Literal["liu2017"], **more: Unpack[_Settings]
-) -> Registration[Affine]: ...
-@overload
-def register(
-    xyz_a: ArrayLike, xyz_b: ArrayLike, *, model: str = ..., method: str = ..., **more: Unpack[_Settings]
-) -> Registration: ...
 
 
 @require_arguments
@@ -238,11 +201,10 @@ def register(
         remedy = f"register one group of rows alone, or allow ambiguous answers{moved}"
         raise DegenerateError("E-REGISTER-TWO-TRANSFORMS", f"{fault}; {remedy}")
     covariance, scaled, redundancy = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
-    other = shifted = None
+    explained, shifted = doubts.Explained(inside, fitted.transform, fitted.sigma), None
     if method != "liu2017":
-        other = doubts.wider(inside, fitted.transform)
-        explained = (inside, fitted.transform) if other is None else (other.problem, other.transform)
-        shifted = doubts.shifted_rows(*explained)
+        explained = doubts.explained(inside, fitted.transform, fitted.sigma)
+        shifted = doubts.shifted_rows(explained.problem, explained.transform)
     if shifted is not None:  # the transform is off by so much if the smaller group is right
         off = np.zeros(len(covariance))
         along = slice(3, None, 4) if len(off) == 12 else slice(3, 6)
@@ -266,7 +228,7 @@ def register(
         seed=seed,
         samples=fitted.samples,
     )
-    return replace(result, notes=tuple(doubts.notes_of(result, problem, other, shifted)))
+    return replace(result, notes=tuple(doubts.notes_of(result, problem, explained, shifted)))
 
 
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances, lines) -> Problem:

@@ -1,7 +1,6 @@
 from .body_scene import BodyOptions as BodyOptions
 from .body_scene import body_camera as body_camera
 from .body_scene import make_body_scene as make_body_scene
-from .body_scene import write_body as write_body
 from .dataset import render_all as render_all
 from .dataset import write_dataset as write_dataset
 from .optics import ThinLens as ThinLens

@@ -1,8 +1,7 @@
 """Photographs of a body held before a camera in changing poses, with its truth: printed faces, and faces of circles."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,7 +14,6 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.synthetic.dataset import TruthFile, image_name, new_dataset, write_scene
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
 DRAWING_PX = 2000  # longer side of the drawing of a face, px
@@ -398,48 +396,3 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, FacePicture]) 
     rng = np.random.default_rng([options.seed, 1, image])
     noisy = grey + options.noise * rng.normal(size=grey.shape)
     return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
-
-
-def body_truth(scene: BodyScene, image_format: str = "jpg") -> TruthFile:
-    """Returns the truth of a body, with the pose of each photograph."""
-    poses = {image_name("", i, image_format): pose.matrix() for i, pose in enumerate(scene.camera_from_target)}
-    return TruthFile(
-        unit="mm",
-        reference_face=scene.target.faces[0].id,
-        target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
-        circles=scene.circles_target(),
-        camera_from_target=poses,
-    )
-
-
-@require_arguments
-def write_body(
-    folder: str | Path,
-    scene: BodyScene,
-    image_format: str = "jpg",
-    jpeg_quality: int = 95,
-    workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Path]:
-    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json``; returns the images' paths.
-
-    Parameters
-    ----------
-    folder : str or Path
-        New or empty folder.
-    scene : BodyScene
-        Of :func:`stcal.synthetic.make_body_scene`.
-    image_format, jpeg_quality : str, int
-        ``jpg`` or ``png``, and the quality of JPEG, up to 100.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (done, total).
-
-    Raises InputError: the folder is not empty or cannot be written.
-    """
-    out = Path(folder)
-    with new_dataset(out):
-        truth, drawings = body_truth(scene, image_format), scene.drawings()
-        jobs = {name: (scene, i, drawings) for i, name in enumerate(truth.camera_from_target or ())}
-        return write_scene(out, scene.target, scene.camera, truth, render_body, jobs, jpeg_quality, workers, progress)

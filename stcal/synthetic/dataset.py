@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -13,15 +13,14 @@ from pydantic import Field
 
 from stcal.boards.board_file import save_board
 from stcal.boards.target_file import save_target
-from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
 from stcal.io.cameras.read import save_camera
 from stcal.io.files import save, unwritable
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
+from stcal.synthetic.body_scene import BodyScene, render_body
 from stcal.synthetic.render import RenderOptions, check_lens, encode, render
 from stcal.synthetic.scene import Scene, image_circles
 
@@ -86,26 +85,25 @@ class TruthFile(ResultFile):
         return {name: pose for name, pose in stated.items() if pose is not None} | (self.camera_from_target or {})
 
     @classmethod
-    def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
+    def of(
+        cls, scene: Scene | BodyScene, image_format: str = "jpg", options: RenderOptions | None = None
+    ) -> "TruthFile":
         """Returns the truth of a scene, with images named by :func:`image_name`."""
-        options = options or RenderOptions()
-        optics: dict[str, Any] = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
-        optics |= {"rim_mm": options.rim_mm} if options.rim_mm else {}
-        given: dict[str, Any] = {"optics": TrueOptics(**optics)} if optics else {}
-        groups = {}
-        for name, group in scene.groups.items():
-            shown = [_circles(scene, name, i) for i in range(len(group.camera_from_target))]
-            images = {
-                image_name(name, i, image_format): TrueImage(camera_from_target=pose.matrix(), circles=shown[i])
-                for i, pose in enumerate(group.camera_from_target)
-            }
-            groups[name] = TrueGroup(board_circles_target=group.board_circles_target, images=images)
+        given: dict[str, Any] = {}
+        if isinstance(scene, BodyScene):
+            circles, poses = scene.circles_target(), enumerate(scene.camera_from_target)
+            given["camera_from_target"] = {image_name("", i, image_format): pose.matrix() for i, pose in poses}
+        else:
+            circles = {str(label): xyz for label, xyz in scene.circles_target.items()}
+            given["groups"] = {name: _true_group(scene, name, image_format) for name in scene.groups}
+            optics: dict[str, Any] = {"lens": TrueLens(**asdict(options.lens))} if options and options.lens else {}
+            optics |= {"rim_mm": options.rim_mm} if options and options.rim_mm else {}
+            given |= {"optics": TrueOptics(**optics)} if optics else {}
         return cls(
             unit="mm",
-            reference_face=scene.reference_face,
+            reference_face=scene.target.faces[0].id,
             target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
-            circles={str(label): xyz for label, xyz in scene.circles_target.items()},
-            groups=groups,
+            circles=circles,
             **given,
         )
 
@@ -115,15 +113,20 @@ def image_name(group: str, image: int, image_format: str = "jpg") -> str:
     return f"{group}/IMG_{FIRST_IMAGE + image}.{image_format}".removeprefix("/")
 
 
-def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
-    shown = image_circles(scene, group, image)
+def _true_group(scene: Scene, name: str, image_format: str) -> TrueGroup:
+    group, images = scene.groups[name], {}
     number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
-    tilts_deg = np.degrees(shown.tilt_rad).tolist()
-    rows = zip(shown.labels, shown.centre_px.round(5), tilts_deg, shown.must_find, strict=True)
-    return {
-        number.get(label, label): TrueCircle(centre_px=centre, tilt_deg=round(tilt_deg, 2), must_find=bool(must_find))
-        for label, centre, tilt_deg, must_find in rows
-    }
+    for i, pose in enumerate(group.camera_from_target):
+        shown = image_circles(scene, name, i)
+        tilts_deg = np.degrees(shown.tilt_rad).tolist()
+        rows = zip(shown.labels, shown.centre_px.round(5), tilts_deg, shown.must_find, strict=True)
+        circles = {
+            number.get(label, label): TrueCircle(centre_px=centre, tilt_deg=round(tilt, 2), must_find=bool(must_find))
+            for label, centre, tilt, must_find in rows
+        }
+        image = TrueImage(camera_from_target=pose.matrix(), circles=circles)
+        images[image_name(name, i, image_format)] = image
+    return TrueGroup(board_circles_target=group.board_circles_target, images=images)
 
 
 @require_arguments
@@ -150,9 +153,6 @@ def render_all(
     return {name: [rendered[k] for k, (group, _) in enumerate(views) if group == name] for name in scene.groups}
 
 
-IMAGE_FORMATS = ("jpg", "png")
-
-
 @contextmanager
 def new_dataset(folder: Path) -> Iterator[None]:
     """Refuses a folder that is not empty or not writable; if the block fails, the folder is left as it was."""
@@ -175,25 +175,25 @@ def new_dataset(folder: Path) -> Iterator[None]:
 @require_arguments
 def write_dataset(
     folder: str | Path,
-    scene: Scene,
+    scene: Scene | BodyScene,
     render_options: RenderOptions | None = None,
-    image_format: str = "jpg",
+    image_format: Literal["jpg", "png"] = "jpg",
     jpeg_quality: int = 95,
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Writes ``images/<group>/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml``, ``board.toml``, ``truth.json``.
 
-    Returns the paths of the images, in order.
+    Returns the paths of the images, in order. A body has neither groups nor a board.
 
     Parameters
     ----------
     folder : path
         Folder of the data set, new or empty.
-    scene : Scene
-        Target, board, camera and views.
+    scene : Scene or BodyScene
+        Target, board, camera and views; or a body with its photographs.
     render_options : RenderOptions, optional
-        Appearance of the photographs; the defaults if None.
+        Appearance of the photographs; the defaults if None. That of a body is in its own options.
     image_format, jpeg_quality : {"jpg", "png"}, int
     workers, progress : int, callable, optional
         Number of processes, one per core by default; called with (done, total).
@@ -201,41 +201,31 @@ def write_dataset(
     Raises InputError: the folder is not empty or cannot be written, or the image format or the lens does not fit.
     """
     folder, options = Path(folder), render_options or RenderOptions()
-    if image_format not in IMAGE_FORMATS:
-        known = ", ".join(IMAGE_FORMATS)
-        raise InputError("E-OPTION-FORM", f"data set: image format {image_format}, one of {known} needed")
+    if isinstance(scene, BodyScene) and render_options is not None:
+        raise InputError("E-OPTION-CONFLICT", "data set: rendering of a body; give BodyOptions to make_body_scene")
     if image_format == "jpg" and options.bit_depth != 8:
         raise InputError("E-OPTION-FORM", f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
     if not 1 <= jpeg_quality <= 100:
         raise InputError("E-OPTION-RANGE", f"data set: JPEG quality {jpeg_quality}, 1 to 100 needed")
     with new_dataset(folder):
-        check_lens(scene, options.lens)
-        save_board(folder / "board.toml", scene.board)
-        jobs = {image_name(*view, image_format): (scene, *view, options) for view in scene.views()}
         truth = TruthFile.of(scene, image_format, options)
-        return write_scene(folder, scene.target, scene.camera, truth, render, jobs, jpeg_quality, workers, progress)
-
-
-def write_scene(
-    folder: Path,
-    target: TargetDesign,
-    camera: Camera,
-    truth: TruthFile,
-    make: Callable[..., np.ndarray],
-    jobs: Mapping[str, tuple],  # arguments of ``make`` by name of the image
-    jpeg_quality: int,
-    workers: int | None,
-    progress: Callable[[int, int], None] | None,
-) -> list[Path]:
-    """Writes camera, target, truth, and the images as they are made, in processes side by side; returns their paths."""
-    save_camera(folder / "cameras.txt", camera)
-    save_target(folder / "target.toml", target)
-    save(folder / "truth.json", json.dumps(truth.content()) + "\n")
-    paths = [folder / "images" / name for name in jobs]
-    calls = [(make, path, own, jpeg_quality) for path, own in zip(paths, jobs.values(), strict=True)]
-    for done, _ in enumerate(run_parallel(_write_image, calls, workers), 1):
-        if progress:
-            progress(done, len(calls))
+        make: Callable[..., np.ndarray]
+        jobs: dict[str, tuple]  # arguments of ``make`` by name of the image
+        if isinstance(scene, BodyScene):
+            make, drawings = render_body, scene.drawings()
+            jobs = {name: (scene, i, drawings) for i, name in enumerate(truth.camera_from_target or ())}
+        else:
+            check_lens(scene, options.lens)
+            save_board(folder / "board.toml", scene.board)
+            make, jobs = render, {image_name(*view, image_format): (scene, *view, options) for view in scene.views()}
+        save_camera(folder / "cameras.txt", scene.camera)
+        save_target(folder / "target.toml", scene.target)
+        save(folder / "truth.json", json.dumps(truth.content()) + "\n")
+        paths = [folder / "images" / name for name in jobs]
+        calls = [(make, path, own, jpeg_quality) for path, own in zip(paths, jobs.values(), strict=True)]
+        for done, _ in enumerate(run_parallel(_write_image, calls, workers), 1):
+            if progress:
+                progress(done, len(calls))
     return paths
 
 

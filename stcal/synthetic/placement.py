@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 
 MAX_FACE_TILT_RAD = np.radians(67)
 MAX_BOARD_TILT_RAD = np.radians(50)
@@ -35,32 +35,15 @@ class GroupShape:
     outline_board: np.ndarray  # (4, 3) corners
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _CandidateViews:
-    """Candidate views: camera_from_target as rotations (n, 3, 3) and camera centres (n, 3) in the target frame."""
+def to_camera(views: Poses, xyz_target: np.ndarray) -> np.ndarray:
+    """Returns points (k, 3) in the frame of every camera, (n, k, 3), of views camera_from_target."""
+    return xyz_target @ np.swapaxes(views.rotation, 1, 2) + views.translation[:, None]
 
-    rotations: np.ndarray
-    centres: np.ndarray
 
-    def rows(self, index: np.ndarray) -> "_CandidateViews":
-        """Returns the views that a mask or indices select."""
-        return _CandidateViews(self.rotations[index], self.centres[index])
-
-    def to_camera(self, xyz_target: np.ndarray) -> np.ndarray:
-        """Returns points (k, 3) in the frame of every camera, (n, k, 3)."""
-        x, y, z = np.moveaxis(xyz_target - self.centres[:, None], 2, 0).copy()
-        r = self.rotations[..., None]
-        # A tenth of the time of numpy.einsum, in whose order it adds, so that earlier scenes can be made again.
-        return np.stack([x * r[:, i, 0] + z * r[:, i, 2] + y * r[:, i, 1] for i in range(3)], axis=2)
-
-    def tilt_rad(self, xyz_target: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Returns the angles between normals and lines of sight, (n, k)."""
-        ray = self.centres[:, None] - xyz_target
-        return np.arccos(np.clip((ray * normals).sum(-1) / np.linalg.norm(ray, axis=-1), -1, 1))
-
-    def pose(self, i: int) -> Rigid:
-        """Returns camera_from_target of view i."""
-        return Rigid(self.rotations[i], -self.rotations[i] @ self.centres[i])
+def tilt_rad(views: Poses, xyz_target: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the angles between normals and lines of sight, (n, k)."""
+    ray = views.inverse().translation[:, None] - xyz_target
+    return np.arccos(np.clip((ray * normals).sum(-1) / np.linalg.norm(ray, axis=-1), -1, 1))
 
 
 def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.ndarray:
@@ -85,8 +68,8 @@ def place_group(
         target_from_board = _board_place(shape, rng)
         tried = max(CANDIDATES, CANDIDATES_PER_VIEW * count)
         views = _candidate_views(shape, target_from_board, camera, tried, distance_mm, spread_rad, rng)
-        faces_seen = np.flatnonzero((views.tilt_rad(shape.circles, shape.normals) <= MAX_FACE_TILT_RAD).all(1))
-        valid = faces_seen[_board_seen(shape, target_from_board, views.rows(faces_seen), camera)]
+        faces_seen = np.flatnonzero((tilt_rad(views, shape.circles, shape.normals) <= MAX_FACE_TILT_RAD).all(1))
+        valid = faces_seen[_board_seen(shape, target_from_board, views[faces_seen], camera)]
         shown = max(shown, len(faces_seen))
         places.append((target_from_board, views, valid))
         if len(valid) >= max(count, GOOD_SHARE * len(faces_seen)):
@@ -97,8 +80,8 @@ def place_group(
         fault = f"{len(valid)} of {tried} views show faces and board ({shown} show the faces), {count} needed"
         remedy = f"take a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm (--distance)"
         raise DegenerateError("E-SCENE-VIEWS", f"{shape.name}: {fault}; {remedy} or a shorter focal length")
-    picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
-    return target_from_board, [views.pose(i) for i in valid[picked]]
+    picked = rng.permutation(_farthest(views[valid].inverse().translation - shape.circles.mean(0), count))
+    return target_from_board, list(views[valid[picked]])
 
 
 def _board_place(shape: GroupShape, rng) -> Rigid:
@@ -114,7 +97,7 @@ def _board_place(shape: GroupShape, rng) -> Rigid:
     return Rigid(rotation, middle + shift @ shape.axes - rotation @ shape.outline_board.mean(0))
 
 
-def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spread_rad, rng) -> _CandidateViews:
+def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spread_rad, rng) -> Poses:
     azimuth, elevation = rng.uniform(-spread_rad, spread_rad, (2, n))
     local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
     direction = np.column_stack(local) @ shape.axes
@@ -122,19 +105,24 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
     points = np.vstack([shape.body, target_from_board @ shape.outline_board])
     aim = (points.min(0) + points.max(0)) / 2
     centres = aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None]
-    views = _CandidateViews(look_along(-direction, shape.axes[1], roll), centres)
+
+    def looking(forward: np.ndarray) -> Poses:
+        rotation = look_along(forward, shape.axes[1], roll)
+        return Poses(rotation, -(rotation @ centres[..., None])[..., 0])
+
+    views = looking(-direction)
     free = np.array([camera.width, camera.height]) / camera.focal / 2 - IMAGE_MARGIN * camera.width / camera.focal
     place = rng.uniform(-0.7, 0.7, (n, 2))
     for step in range(3):
-        xyz = views.to_camera(points)
+        xyz = to_camera(views, points)
         xy = xyz[..., :2] / xyz[..., 2:]
         by_point = np.swapaxes(xy, 0, 1).copy()  # reductions along the first axis are far faster
         low, high = by_point.min(0), by_point.max(0)
         offset = place * np.maximum(free - (high - low) / 2, 0) if step == 2 else 0
         towards_middle = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
-        forward = np.einsum("nji,nj->ni", views.rotations, towards_middle)
+        forward = np.einsum("nji,nj->ni", views.rotation, towards_middle)
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        views = _CandidateViews(look_along(forward, shape.axes[1], roll), views.centres)
+        views = looking(forward)
     return views
 
 
@@ -148,15 +136,15 @@ def look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.ndar
     return np.stack([c * x - s * y, s * x + c * y, forward], axis=1)
 
 
-def _board_seen(shape, target_from_board, views: _CandidateViews, camera: Camera) -> np.ndarray:
+def _board_seen(shape, target_from_board, views: Poses, camera: Camera) -> np.ndarray:
     """Returns the mask of the views that show the board, (n,). What takes most time is tested last, of what is left."""
     outline = target_from_board @ shape.outline_board
     # The tangent of the tilt grows with the distance from the camera's foot, which is largest at a corner of the dots.
     dots = target_from_board @ shape.dots_board[ConvexHull(shape.dots_board[:, :2]).vertices]
     facing = -target_from_board.rotation[:, 2]
-    valid = (views.tilt_rad(dots, np.broadcast_to(facing, dots.shape)) <= MAX_BOARD_TILT_RAD).all(1)
+    valid = (tilt_rad(views, dots, facing) <= MAX_BOARD_TILT_RAD).all(1)
     points = np.concatenate([shape.body, outline])
-    xyz = views.rows(valid).to_camera(points)
+    xyz = to_camera(views[valid], points)
     in_front = (xyz[..., 2] > 0).all(1)
     valid[valid] = in_front
     xy = xyz[in_front, :, :2] / xyz[in_front, :, 2:]

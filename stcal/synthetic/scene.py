@@ -145,11 +145,6 @@ class Scene(Brief):
     def __post_init__(self):
         require_fields(self, "scene", seed=0, margin_mm=0)
 
-    @property
-    def reference_face(self) -> str:
-        """Id of the face whose frame is the target frame."""
-        return self.target.faces[0].id
-
     def views(self) -> list[tuple[str, int]]:
         """Returns group and number of all photographs."""
         return [(name, i) for name, group in self.groups.items() for i in range(len(group.camera_from_target))]

@@ -200,12 +200,12 @@ WRONG_TARGETS = {
     "collinear": (changed("x_mm = 0, y_mm = 40", "x_mm = 80, y_mm = 0"), "E-TARGET-FRAME … 1 … 2 … 3"),
     "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "E-TARGET-FRAME"),
     "two faces alike": (TARGET + changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE),
-                        "E-TARGET-LIKENESS … 1 … 2 … 0 … 0 … one of them"),
+                        "E-TARGET-LIKENESS … 1 … 2 … 1.00 … change one"),
     "a face at another size": (
-        TARGET + FACE_OF_60, "E-TARGET-LIKENESS … 1 … 2 … 1.50 … 0"),
+        TARGET + FACE_OF_60, "E-TARGET-LIKENESS … 1 … 2 … 1.50"),
     "a face among more circles": (
         TARGET + FACE_OF_60.replace("},\n]\n", "},\n"  '{ id = "5", x_mm = 90, y_mm = 90, radius_mm = 6 }]\n'),
-        "E-TARGET-LIKENESS … 4 … 1 … 2 … 1.50"),
+        "E-TARGET-LIKENESS … 1 … 2 … 1.50"),
     "a face of half a turn": (changed("radius_mm = 4", "radius_mm = 8"), "E-TARGET-LIKENESS … 1 … 90"),
     "rough pose without normal": (changed('y = "3"', 'y = "3"\nrough_pose = { origin_mm = [0, 0, 0], x = [1, 0, 0] }'),
                                   "E-KEY-MISSING … 1. … rough_pose"),

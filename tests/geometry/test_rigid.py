@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Affine, Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
-from tests.outcome import fails_with, refuses
+from stcal.geometry.rigid import Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
+from tests.outcome import refuses
 
 TOLERANCE_MM = 1e-9
 """Rounding: three products of coordinates below 1e4 mm lose about 1e4 · 1e-16 · 10 = 1e-11 mm."""
@@ -279,14 +279,3 @@ OFF_ZERO = LINE + np.array([1000.0, 0, 0])  # a line that misses the origin
 )
 def test_degenerate(align, xyz_a, xyz_b, weights, message):
     refuses(message, align, xyz_a, xyz_b, weights)
-
-
-def test_affine_transforms_compose_and_invert():
-    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
-    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
-    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
-    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
-    with fails_with("E-AFFINE-SINGULAR"):
-        Affine(np.ones((3, 3)), np.zeros(3)).inverse()

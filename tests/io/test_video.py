@@ -17,7 +17,8 @@ from stcal.io.images import find_images
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.run_options import RunOptions
-from stcal.synthetic.body_scene import BodyOptions, body_camera, body_truth, make_body_scene, render_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, render_body
+from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.designs import tag_cube
 from tests.outcome import refuses
 
@@ -129,7 +130,7 @@ def test_a_cube_that_turns_before_a_camera_is_calibrated(tmp_path):
     moving_scene, drawings = replace(scene, camera_from_target=tuple(poses)), scene.drawings()
     frames = [render_body(moving_scene, k, drawings) for k in range(len(poses))]
     frames = [cv2.blur(frame, (9, 1)) if k % 3 == 0 else frame for k, frame in enumerate(frames)]
-    video, truth = clip_of(frames, tmp_path / "clip.mp4"), body_truth(replace(scene, camera_from_target=()))
+    video, truth = clip_of(frames, tmp_path / "clip.mp4"), TruthFile.of(replace(scene, camera_from_target=()))
     (tmp_path / "truth.json").write_text(json_text(truth), encoding="utf-8")
     result = pipeline.run(video, scene.camera, tmp_path / "run", scene.target, options=RunOptions(workers=1))
     numbers = [int(path.stem[-6:]) for path in sorted((tmp_path / "run/.stcal/cache/frames").iterdir())]

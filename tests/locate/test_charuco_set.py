@@ -12,9 +12,7 @@ from tests.support.holdout import half_calibrated, subset_trials
 
 pytestmark = pytest.mark.slow  # a set that lies beside the repository
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
-PLAN = LayoutPlan(
-    "charuco", tuple((BOARD.dictionary, k) for k in range(17)), np.full(17, 18.256), 8, np.full((17, 4, 2), np.nan)
-)
+PLAN = LayoutPlan("charuco", tuple((BOARD.dictionary, k) for k in range(17)), 8, np.full((17, 4, 2), np.nan))
 
 
 @pytest.fixture(scope="module", params=sampled([[10, 1], [16, 0], [16, 1]]))

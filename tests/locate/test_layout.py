@@ -13,7 +13,7 @@ from stcal.locate.layout import LayoutPlan, layout_toml, load_layout, load_plan
 from stcal.locate.layout_calibration import CalibratedLayout, ImageCorners, _turned_alike, calibrate
 from tests.levels import sampled
 from tests.outcome import refuses
-from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
+from tests.support.tags import CAMERA, example_layout, random_pose
 
 HEAD = 'type = "tags"\n'
 TAG = '[[tag]]\ndictionary = "4x4_50"\nid = {}\n'
@@ -76,9 +76,7 @@ def test_what_is_wrong_is_named(tmp_path, text, reason):
 BOARD = ChessboardDesign(6, 9, 20.0)
 LAYOUT = example_layout()
 BOARD_FROM_OBJ = Rigid(Rotation.from_rotvec([0, 0, 0.3]).as_matrix(), [250.0, 60.0, 0.0])
-PLAN = LayoutPlan(
-    "example", LAYOUT.tags, np.array([size for _, _, size, _, _ in PLACES]), 0, np.full((6, 4, 2), np.nan)
-)
+PLAN = LayoutPlan("example", LAYOUT.tags, 0, np.full((6, 4, 2), np.nan))
 CORNER_PX, BOARD_PX = 0.1, 0.05
 FLAT = np.pad(LAYOUT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
 
@@ -192,7 +190,7 @@ def test_what_cannot_be_calibrated_is_named():
 def test_deviation_from_nominal_places():
     nominal = np.array(LAYOUT.corners_mm)
     nominal[3] += [3.0, 0.0]  # a tag that was glued 3 mm off
-    plan = LayoutPlan("example", LAYOUT.tags, PLAN.size_mm, 0, nominal)
+    plan = LayoutPlan("example", LAYOUT.tags, 0, nominal)
     result = calibrate(plan, *views(8, 1), CAMERA)
     assert int(np.argmax(result.deviation_mm)) == 3
     assert 1.5 < result.deviation_mm[3] < 3.5  # the fit of all takes part of it

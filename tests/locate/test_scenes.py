@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraModel
 from stcal.locate.layout import TargetLayout
-from stcal.locate.scenes import LocateOptions, SceneTags, detect, find_scenes, locate_image, locate_scene, run
+from stcal.locate.scenes import LocateOptions, detect, find_scenes, locate_image, locate_scene, run
 from stcal.synthetic.optics import Light, expose
 from tests.levels import sampled
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
@@ -31,7 +31,7 @@ def plain():
 @pytest.fixture(scope="module")
 def seen(plain):
     """What one photograph shows, to be located by other layouts and cameras."""
-    return SceneTags("plain", (detect(plain, "plain", LAYOUT.dictionaries()),))
+    return (detect(plain, "plain", LAYOUT.dictionaries()),)
 
 
 @pytest.fixture
@@ -44,8 +44,8 @@ def located(tmp_path):
     return of
 
 
-def in_scene(tags, layout, model=MODEL, image=None):
-    return locate_scene(tags, layout, model, LocateOptions(), lambda _: image)
+def in_scene(exposures, layout, model=MODEL, image=None):
+    return locate_scene("plain", exposures, layout, model, LocateOptions(), lambda _: image)
 
 
 def error_of(result, truth: Rigid = TRUTH) -> np.ndarray:

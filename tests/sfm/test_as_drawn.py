@@ -16,7 +16,8 @@ from stcal.sfm.mapping.body import BodyCorners, place_with_camera, wrong_sizes
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.saved import load_run
-from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene
+from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.designs import tag_cube
 from tests.levels import sampled
 from tests.outcome import fails_with
@@ -69,7 +70,7 @@ def test_a_face_on_another_side_is_not_the_one_drawn(turned, named):
 
 @pytest.mark.parametrize("what", sampled(["size", "id"]))
 def test_one_tag_of_another_size_or_id_is_named(tmp_path, no_page, what):
-    write_body(
+    write_dataset(
         tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
     )
     text = target_toml(CUBE)

@@ -35,7 +35,8 @@ from stcal.sfm.report.compare import compare
 from stcal.sfm.report.judgement import TESTED_BY
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
+from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body
+from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import FULL, sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
@@ -346,7 +347,7 @@ def photographed(tmp_path_factory):
     """Ten photographs of a cube of tags with their truth, not to be written to; and the scene."""
     scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=10, distance_mm=300, seed=2))
     folder = tmp_path_factory.mktemp("photographed") / "set"
-    write_body(folder, scene)
+    write_dataset(folder, scene)
     return folder, scene
 
 
@@ -423,7 +424,7 @@ def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path, 
     """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
     options = BodyOptions(images=7, distance_mm=420, seed=4, noise=0.005)
     scene = make_body_scene(second_design()[0], body_camera(560), options)
-    write_body(tmp_path / "set", scene)
+    write_dataset(tmp_path / "set", scene)
     truth = scene.circles_target()
     ends = CircleLabel("top", "A"), CircleLabel("left", "q")
     long = float(np.linalg.norm(truth[str(ends[0])] - truth[str(ends[1])]))

@@ -107,7 +107,7 @@ def test_refusals(tmp_path, scene):
     refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path, scene)
     refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path / "mine.txt", scene)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
-    refuses("E-OPTION-FORM … tif", write_dataset, tmp_path / "new", scene, image_format="tif")
+    refuses("E-OPTION-VALUE … tif", write_dataset, tmp_path / "new", scene, image_format="tif")
     refuses("E-OPTION-FORM", write_dataset, tmp_path / "new", scene, RenderOptions(bit_depth=16))
 
 

@@ -28,7 +28,7 @@ def test_poses_are_three_point_frames_of_the_circles(scene):
         assert np.abs([*local[0], *local[1, 1:], local[2, 2]]).max() < 1e-12
         assert local[1, 0] > 0
         assert local[2, 1] > 0
-    np.testing.assert_allclose(scene.target_from_face[scene.reference_face].matrix(), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(scene.target_from_face[scene.target.faces[0].id].matrix(), np.eye(4), atol=1e-12)
 
 
 def test_made_differs_from_design_as_much_as_asked(scene):
@@ -87,7 +87,7 @@ def test_views_spread_widely(scene):
 
 
 def test_same_seed_same_scene_and_other_seed_another(scene):
-    again = make_scene(OPTIONS) if scene.reference_face == "1" else make_scene(OPTIONS, *second_design())
+    again = make_scene(OPTIONS) if scene.target.name == "reference target" else make_scene(OPTIONS, *second_design())
     other = make_scene(replace(OPTIONS, seed=4))
     np.testing.assert_equal(again.circles_target, scene.circles_target)
     for name, g in scene.groups.items():

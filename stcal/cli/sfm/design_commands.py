@@ -98,7 +98,8 @@ def simulate(
         printed = body_scene.BodyOptions(images, distance, seed=seed, **errors)
         held = body_scene.make_body_scene(body, with_camera, printed)
         with StageProgress() as progress:
-            paths = body_scene.write_body(folder, held, kind, workers=workers, progress=partial(progress, "render"))
+            step = partial(progress, "render")
+            paths = write_dataset(folder, held, image_format=kind, workers=workers, progress=step)
         say(f"{len(paths)} images: {folder}")
         print_each("note", filter(None, [held.hardly_seen()]))
         return
