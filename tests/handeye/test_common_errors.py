@@ -7,12 +7,12 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.handeye import handeye
-from stcal.handeye.data.pose_pairs import read_poses
+from stcal.handeye.data.pose_content import Said
+from stcal.handeye.data.pose_files import read_two
 from stcal.handeye.handeye_problem import HandEyeOptions, HandEyeProblem
 from stcal.handeye.validate import with_common_errors, with_jackknife
-from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, common_columns
-from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
+from stcal.workflows.handeye_inputs import HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye
 from tests.handeye.written import table
 from tests.support.handeye import handeye as handeye_by
@@ -89,13 +89,12 @@ def test_they_are_read_from_what_measure_writes(tmp_path):
     common = np.swapaxes(pairs.camera_from_board_common, 1, 2).reshape(len(board), -1)
     errors |= dict(zip(common_columns(3), common.T.tolist(), strict=True))
     robot = table(tmp_path / "robot.csv", {"": flange}, image=images)
-    joined = join_tables(robot, table(tmp_path / "poses.csv", {"": board}, image=images, **errors), "image", PREFIXES)
-    as_read = read_poses(joined.table)
+    poses = table(tmp_path / "poses.csv", {"": board}, image=images, **errors)
+    as_read = read_two(robot, poses, Said(), "image").pairs
     assert np.allclose(as_read[[3, 5]].camera_from_board_common, pairs.camera_from_board_common[[3, 5]], rtol=1e-9)
-    columns = {
-        name.replace("camera_from_board", "board_from_camera"): own for name, own in joined.table.columns.items()
-    }
-    inverse = read_poses(replace(joined.table, columns=columns))
+    named = {f"board_from_camera_{name}": values for name, values in errors.items()}
+    turned = table(tmp_path / "inverse.csv", {"board_from_camera": board}, image=images, **named)
+    inverse = read_two(robot, turned, Said(), "image").pairs
     step = 1e-4 * pairs.camera_from_board_common[:, :, 1]
     moved = board.moved(step).inverse().difference(board.inverse())
     assert np.allclose(1e-4 * inverse.camera_from_board_common[:, :, 1], moved, rtol=1e-3, atol=1e-9)

@@ -102,7 +102,7 @@ def test_two_files_of_poses(written, poses, tmp_path):
     given = workflows.read_handeye(robot, second=camera, setup="eye-in-hand")
     found = workflows.calibrate_handeye(given, "pose", repeats=0)
     assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
-    assert given.notes == (f"1 rows of {camera} have no partner: image p99",)
+    assert given.left_out == (("p99", "in camera.csv alone"),)
 
 
 def test_plan_handeye(written, poses):

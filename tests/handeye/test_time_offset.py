@@ -116,13 +116,12 @@ def test_times_of_images_in_a_file(command, tmp_path):
     code, shown, error = command(*given, "--dry-run", "--image-times", times)
     assert code == 0, error
     assert "1 at a sample, 1 interpolated" in shown
-    assert "left out c.png: no time in" in shown
-    said = "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)"
-    assert_error(command(*given, "--dry-run"), INPUT, said)
+    assert "left out c.png: no time" in shown
+    assert_error(command(*given, "--dry-run"), INPUT, "no times of its poses or images, like a.png", "--image-times")
     for row, said in (
         ("a,soon", "time_s of a.png is 'soon', a number of"),
-        ("z,1.5", "no row is of an image: z"),
-        ("a,9.5", "no image has a pose: a.png"),
+        ("z,1.5", "no row is of an image, or an image has two: z"),
+        ("a,9.5", "none has a pose of the robot: first a.png"),
     ):
         times.write_text(f"image,time_s\n{row}\n")
         assert_error(command(*given, "--dry-run", "--image-times", times), INPUT, said)

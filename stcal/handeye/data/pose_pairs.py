@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -12,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
-from stcal.geometry.rigid import Order, Poses, Rigid, skew
-from stcal.io.table import LENGTHS, Table, read_table
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.io.table import LENGTHS
 
 Role = Literal["robot", "camera"]
 SIDES: dict[Role, tuple[str, str]] = {
@@ -176,49 +175,6 @@ def rms_of(differences: np.ndarray) -> tuple[float, float]:
     """Returns the RMS lengths of differences of poses, (m, 6): rad, mm."""
     turn, shift = np.sqrt((differences.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
     return float(turn), float(shift)
-
-
-def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
-    """Read a CSV file of pose pairs.
-
-    Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
-    ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
-    The camera's side may also have ``…_common1_rx`` …, what the errors of its poses have in common.
-
-    Parameters
-    ----------
-    path : the file
-    quaternions : {"wxyz", "xyzw"}, ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order
-        of the columns
-
-    Returns
-    -------
-    HandEyePoses
-        Poses in mm; pairs are named by their lines.
-
-    Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
-    line; copied poses.
-    """
-    table = read_table(path, "pose file", quaternions)
-    sides = [read_side(table, *names) for names in SIDES.values()]
-    (flange, flange_covariance, _), (board, board_covariance, common) = sides
-    names = tuple(f"line {line}" for line in table.lines)
-    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where, common)
-
-
-def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
-    """Returns poses ``wanted``, covariances and common errors, from the columns of ``wanted`` or of its inverse."""
-    names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
-    if len(names) != 1:
-        fault = "no such columns" if not names else "both"
-        needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
-        other = [name for side in SIDES.values() if wanted not in side for name in side]
-        swapped = not names and any(column.startswith(f"{name}_") for name in other for column in table.columns)
-        exchanged = "; it has those of the other side: exchange the files" if swapped else ""
-        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}{exchanged}")
-    poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
-    common = table.common_errors(covariance, names[0] + "_")
-    return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
 
 
 def inverted(

@@ -7,11 +7,10 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import read_robot
-from stcal.handeye.data.pose_partners import rows_of_images
+from stcal.handeye.data.pose_partners import paired
 from stcal.workflows.handeye_inputs import Files
 from tests.handeye.test_cli import NOISE
-from tests.handeye.written import FORMATS, REFUSED, easy_handeye, poses_file
+from tests.handeye.written import FORMATS, REFUSED, easy_handeye, poses_file, read_robot, table
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.support.handeye import simulated
 
@@ -66,13 +65,33 @@ def test_names_of_rows_are_those_of_images(tmp_path):
     columns = ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
     row = "0.png,0.1,0.2,0.3,1,0,0,0\n"
     (tmp_path / "poses.csv").write_text(f"image,{columns}\n{row}g/{row}")
-    with fails_with("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'"):
-        rows_of_images(read_robot(tmp_path / "poses.csv", Said()), ["g/0.png"])
+    assert paired(read_robot(tmp_path / "poses.csv", Said()), ["g/0.png"], "images").left_out == (
+        ("0.png", "in poses.csv alone"),
+    )
     np.savez(tmp_path / "r.npz", base_from_flange=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
-    found = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
-    assert rows_of_images(found, ["a/0.png", "a/10.png", "a/7.png"]) == ({"a/0.png": 0, "a/10.png": 2}, ("1",), "")
-    with fails_with("E-IMAGE-NAME-AMBIGUOUS … pose 2 … 1 … a/1.png … b/1.png"):
-        rows_of_images(found, ["a/1.png", "b/1.png"])
+    robot = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
+    found = paired(robot, ["a/0.png", "a/10.png", "a/7.png"], "in/a")
+    assert (found.robot.names, found.rows) == (("0", "10"), [0, 1])
+    assert found.left_out == (("1", "in r.npz alone"), ("a/7.png", "in a alone"))
+    with fails_with("E-POSES-UNMATCHED … a/1.png"):  # of two folders
+        paired(robot, ["a/1.png", "b/1.png"], "in")
+
+
+def test_tables_of_the_package_are_joined_by_their_names(tmp_path):
+    """Rows of one of them are named, and rows without names are not joined by their order."""
+    rows, names = [0, 1, 2, 4, 5, 6], [f"{i}.png" for i in range(len(PAIRS))]
+    first = table(tmp_path / "a.csv", {"base_from_flange": PAIRS.base_from_flange}, image=names)
+    second = table(tmp_path / "b.csv", {"": PAIRS.camera_from_board[rows]}, image=[names[i] for i in rows])
+    found = Files(first, second=second).read()
+    assert (found.left_out, found.understood) == ((("3.png", "in a.csv alone"),), ())
+    assert np.abs(found.pairs.camera_from_board.difference(PAIRS.camera_from_board[rows])).max() < ROUNDING
+    with fails_with("E-TABLE-COLUMN-MISSING … shot … --key"):
+        Files(first, second=second, key="shot").read()
+    alone = table(tmp_path / "c.csv", {"camera_from_board": PAIRS.camera_from_board})
+    with fails_with("E-TABLE-COLUMN-MISSING … c.csv … image"):
+        Files(first, second=alone).read()
+    with fails_with("E-OPTION-NEEDS … --length-unit"):
+        Files(first, second=second, statements=Said(length_unit="m")).read()
 
 
 OWN = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
@@ -130,7 +149,7 @@ def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path,
     for line, text in (
         (0, "robot: robot.csv: table; 12 poses; base_from_flange by default; a, b, c as Euler angles ZYX"),
         (1, "camera: camera.npy: NumPy array; 12 poses; camera_from_board by default; 4×4 matrices; mm by"),
-        (2, "rows joined by their order, for neither file has names or times"),
+        (2, "rows joined by their order, for the robot's have no names: line 2 with pose 1"),
         (3, "setup: eye-in-hand, as you say"),
         (4, "pairs: 12"),
     ):

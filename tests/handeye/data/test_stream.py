@@ -7,8 +7,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_content import PoseSide
+from stcal.handeye.data.pose_partners import paired
 from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
-from stcal.workflows.handeye_inputs import Files, robot_at_images
+from stcal.workflows.handeye_inputs import times_of_images
 from tests.outcome import fails_with
 from tests.support.handeye import disturbed
 from tests.support.handeye_stream import trajectory
@@ -90,6 +91,7 @@ def test_more_images_than_samples():
     places = tuple(f"line {k + 2}" for k in range(5))
     robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
     seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
-    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
-    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
-    assert np.abs(at.poses.difference(trajectory(seconds, PHASE))).max() < 0.01
+    images = [f"{t:.2f}.png" for t in seconds]
+    found = paired(robot, images, "images", times_of_images(images, None))
+    assert (found.rows, found.robot.names[-1], found.left_out) == (list(range(9)), "0.33.png", ())
+    assert np.abs(found.robot.poses.difference(trajectory(seconds, PHASE))).max() < 0.01
