@@ -26,7 +26,7 @@ from stcal.adjust.blocks import (
     numbers,
     sigma_factor,
 )
-from stcal.errors import InputError
+from stcal.errors import ConvergenceError, InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
 from stcal.geometry.normal_equations import (
@@ -272,6 +272,9 @@ class Solution:
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Return the step of kept, then eliminated unknowns, damped for the kept ones, and its predicted gain."""
+        if not np.isfinite(self.normal).all():
+            fault = "adjustment: no minimum, as its equations are not finite"
+            raise ConvergenceError("E-NO-MINIMUM", f"{fault}; check all sizes that are stated, and the camera")
         scale = np.sqrt(np.maximum(np.diag(self.normal), TINY))
         unit = self.normal / scale[:, None] / scale + damping * np.eye(self.kept)
         try:

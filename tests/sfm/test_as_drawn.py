@@ -1,26 +1,21 @@
 """Faces that are not where the design draws them."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stcal.boards.target_file import target_toml
-from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, not_as_drawn
-from stcal.sfm.mapping.body import BodyCorners, place_with_camera, wrong_sizes
-from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.designs import tag_cube
 from tests.levels import sampled
-from tests.outcome import fails_with
 
 pytestmark = pytest.mark.slow
 
@@ -101,39 +96,3 @@ def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
     assert "; faces are 0.1 times as far" in judged.use
     assert judged.limit == "The drawing: faces are 0.1 times as far."
     assert judged.next.startswith("Check the sizes.")
-
-
-@pytest.fixture(scope="module")
-def photographed():
-    """The cube's scene, and its corners in 16 images."""
-    scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
-    return scene, corners_seen(scene, 0.02)[0]
-
-
-@pytest.mark.parametrize(("faces", "factor"), [((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)])
-def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(photographed, faces, factor):
-    """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
-    scene, images = photographed
-    rng = np.random.default_rng(0)
-    noisy = [replace(each, centre_px=each.centre_px + rng.normal(0, 0.02, each.centre_px.shape)) for each in images]
-    rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
-
-    def named(design: TargetDesign) -> dict[int, float]:
-        return wrong_sizes(BodyCorners(noisy, design.faces), rough)[0]
-
-    assert named(CUBE) == {}
-    drawn = list(CUBE.faces)
-    for face in faces:
-        drawn[face] = replace(drawn[face], xy_mm=drawn[face].xy_mm / factor)
-    found = named(replace(CUBE, faces=tuple(drawn)))
-    assert sorted(found) == sorted(faces)
-    assert list(found.values()) == pytest.approx([factor] * len(faces), rel=0.05)
-    with fails_with(f"E-BODY-SIZES … face {CUBE.faces[faces[0]].id}"):
-        place_with_camera(noisy, drawn, rough)
-
-
-def test_of_two_faces_none_is_blamed_for_its_size(photographed):
-    scene, images = photographed
-    one, two = (next(face for face in CUBE.faces if face.id == name) for name in ("1", "5"))
-    with fails_with("E-BODY-SIZES … faces 1 and 5 contradict one another … face 5 is 10 times as large against face 1"):
-        place_with_camera(images, [one, replace(two, xy_mm=two.xy_mm / 10)], scene.camera)

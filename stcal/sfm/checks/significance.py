@@ -104,21 +104,14 @@ class Trial:
 
     Parameters
     ----------
-    name : str
-        Image, label, face, group …
-    value : float
-        Value to show. It grows with the root of ``statistic`` (if ``ratio``, its logarithm does).
-    unit : str
-        Of ``value``.
-    statistic : float
-        By chance it follows χ² with ``freedom`` degrees of freedom: the square of a value over its σ, with 1.
-    freedom : int
-        Degrees of freedom of ``statistic``.
-    redundancy : float
-        Degrees of freedom with which its σ is estimated (F test); a stated σ if not given. If there are none, which is
-        where images are so few that free poses and points explain them, nothing can be tested.
-    ratio : bool
-        Whether ``value`` is a ratio.
+    name : Image, label, face, group …
+    value : Value to show. It grows with the root of ``statistic`` (if ``ratio``, its logarithm does).
+    unit : Of ``value``.
+    statistic : By chance it follows χ² with ``freedom`` degrees of freedom: the square of a value over its σ, with 1.
+    freedom : Degrees of freedom of ``statistic``.
+    redundancy : Degrees of freedom with which its σ is estimated (F test); a stated σ if not given. If there are none,
+        which is where images are so few that free poses and points explain them, nothing can be tested.
+    ratio : Whether ``value`` is a ratio.
     """
 
     name: str
@@ -155,24 +148,19 @@ def judge(
 
     Parameters
     ----------
-    key, title : str
-        As of :class:`Check`.
-    trials : sequence of Trial
-        What is tested. The probability of the worst one by chance, times their number (Bonferroni), gives the verdict.
-    what : str
-        Kind of thing tested, in the plural, for the reason.
-    remedy : str
-        What to do if it is not passed.
-    worst : str
-        Worst possible verdict, for faults that do no harm.
-    covered : bool
-        Whether σ of the result that are up to :data:`MOST_ENLARGED` times as large cover what is found. It is then
-        suspicious, and enlarges them by the ratio of all values to their σ (Birge's), or of the worst to its limit.
+    key, title : As of :class:`Check`.
+    trials : What is tested. The probability of the worst one by chance, times their number (Bonferroni), gives the
+        verdict.
+    what : Kind of thing tested, in the plural, for the reason.
+    remedy : What to do if it is not passed.
+    worst : Worst possible verdict, for faults that do no harm.
+    covered : Whether σ of the result that are up to :data:`MOST_ENLARGED` times as large cover what is found. It is
+        then suspicious, and enlarges them by the ratio of all values to their σ (Birge's), or of the worst to its
+        limit.
 
     Returns
     -------
-    Check
-        "not possible" without trials.
+    Check : "not possible" without trials.
     """
     usable = [trial for trial in trials if trial.redundancy > 0]
     if not usable:

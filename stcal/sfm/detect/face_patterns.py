@@ -3,6 +3,7 @@ which is extended to all circles of a face. A face is named only if one reading 
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 
@@ -29,45 +30,27 @@ MAX_SIZE_RATIO = 1.25
 """Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Starts:
-    """n hypotheses, the best supported first: first outline (n,), number of the face (n,), ``circles`` (n, s) of this
-    face, and ``candidates`` (n, s) that match them, −1 if there is none."""
+    """n hypotheses, the best supported first."""
 
-    def __init__(self, origin: np.ndarray, face: np.ndarray, circles: np.ndarray, candidates: np.ndarray):
-        self.origin, self.face, self.circles, self.candidates = origin, face, circles, candidates
-        row, column = np.nonzero(candidates >= 0)
-        keys = np.stack([face[row], circles[row, column], candidates[row, column]])
-        order = np.lexsort(keys[::-1])
-        keys, row = keys[:, order], row[order]
-        begin = np.flatnonzero(np.diff(keys, prepend=-1).any(0))
-        matches = zip(*keys[:, begin].tolist(), strict=True)  # of face, circle and candidate
-        self.rows = dict(zip(matches, np.split(row, begin)[1:], strict=True))
+    origin: np.ndarray  # (n,) first outline
+    face: np.ndarray  # (n,) number of the face
+    circles: np.ndarray  # (n, s) of this face
+    candidates: np.ndarray  # (n, s) that match them, −1 if there is none
 
     def agree(self, face: int, index: np.ndarray) -> np.ndarray:
         """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
-        matched = np.flatnonzero(index >= 0)
-        keys = zip(matched.tolist(), index[matched].tolist(), strict=True)
-        same = [self.rows.get((face, *key), np.zeros(0, int)) for key in keys]
-        count = np.bincount(np.concatenate([np.zeros(0, int), *same]), minlength=len(self.origin))
-        return np.flatnonzero(count >= 2)
+        rows = np.flatnonzero(self.face == face)
+        matches = self.candidates[rows]
+        return rows[((matches >= 0) & (index[self.circles[rows]] == matches)).sum(1) >= 2]
 
-    def index(self, ranks: list[int], width: int) -> np.ndarray:
+    def index(self, ranks: np.ndarray, width: int) -> np.ndarray:
         """Returns the candidate of each circle of the hypotheses' faces, (ranks, width), −1 if there is none."""
         index = np.full((len(ranks), width), -1)
         row, column = np.nonzero(self.candidates[ranks] >= 0)
         index[row, self.circles[ranks][row, column]] = self.candidates[ranks][row, column]
         return index
-
-    def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
-        """Returns a hypothesis and ``wanted`` ones behind it that are not likely to grow to the same reading."""
-        left, chosen = wanted.copy(), []
-        left[:rank], left[rank] = False, True
-        while len(chosen) < AT_ONCE and left.any():
-            chosen.append(int(left.argmax()))
-            index = self.index(chosen[-1:], int(self.circles.max(initial=0)) + 1)[0]
-            left[self.agree(int(self.face[chosen[-1]]), index)] = False
-            left[chosen[-1]] = False
-        return chosen
 
 
 class _Pairs:
@@ -121,8 +104,8 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
         tries[first] += rank >= FIRST_HYPOTHESES
         if rank not in grown:
             wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
-            wanted[list(grown)] = False
-            grown |= _grown(candidates, target, starts, starts.unlike(rank, wanted))
+            wanted[:rank], wanted[rank] = False, True
+            grown = _grown(candidates, target, starts, np.flatnonzero(wanted)[:AT_ONCE])
         match, number = grown[rank], int(starts.face[rank])
         face = target.faces[number]
         if match is None:
@@ -137,13 +120,13 @@ def find_faces(candidates: Candidates, target: TargetDesign) -> tuple[list[FaceS
     return _decide(readings, target)
 
 
-def _grown(candidates: Candidates, target: TargetDesign, starts: _Starts, ranks: list[int]):
+def _grown(candidates: Candidates, target: TargetDesign, starts: _Starts, ranks: np.ndarray):
     """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
     circles, face = _pairs(target), starts.face[ranks]
     index = starts.index(ranks, circles.face_radius.shape[1])
     found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
     size = [len(target.faces[number].ids) for number in face.tolist()]
-    grown = zip(ranks, *found, size, strict=True)
+    grown = zip(ranks.tolist(), *found, size, strict=True)
     return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
 

@@ -287,14 +287,10 @@ class Detection(ByValue):
 
     Parameters
     ----------
-    labels : tuple of Label
-        n labels: ``face:circle``, or ``board:row:column`` from 0.
-    xy_px : (n, 2) array
-        Centres of the ellipses, px, with the centre of the top-left pixel at (0, 0).
-    covariance_px2 : (n, 2, 2) array
-        Covariances of the centres.
-    notes : tuple of str
-        What was left out, and why.
+    labels : n labels: ``face:circle``, or ``board:row:column`` from 0.
+    xy_px : Centres of the ellipses, (n, 2) px, with the centre of the top-left pixel at (0, 0).
+    covariance_px2 : Covariances of the centres, (n, 2, 2).
+    notes : What was left out, and why.
     """
 
     labels: tuple[Label, ...]
@@ -336,26 +332,19 @@ def detect_circles(
 
     Parameters
     ----------
-    image : (height, width) or (height, width, 3) array
-        Grey or RGB, 8 or 16 bit, of the camera's size.
-    camera : Camera
-        The camera that took the image, or its file.
-    target : TargetDesign
-        Design of the target, or its file.
-    board : BoardDesign, optional
-        The dot board, if it may be in view, or its file.
-    options : EllipseOptions, optional
-        Options of the search; the defaults if None.
+    image : Grey or RGB array, (height, width) or (height, width, 3), 8 or 16 bit, of the camera's size.
+    camera : The camera that took the image, or its file.
+    target : Design of the target, or its file.
+    board : The dot board, if it may be in view, or its file.
+    options : Options of the search; the defaults if None.
 
     Returns
     -------
-    Detection
-        Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
+    Detection : Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
 
     Raises
     ------
-    InputError
-        The array is no image, or not of the camera's size.
+    InputError : The array is no image, or not of the camera's size.
     """
     grey = grey_of(image, "image")
     camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)

@@ -3,15 +3,18 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.special import chdtri
 from threadpoolctl import ThreadpoolController
 
 from stcal.boards.finders import why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DetectionError, InputError, StcalError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -30,6 +33,8 @@ from stcal.sfm.detect.detect_files import copy_of, detect_files, load_image, siz
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image, without_defocus
 from stcal.sfm.measurement.pose import (
+    FAILED,
+    MIN_CIRCLES,
     PoseOptions,
     TargetPose,
     common_errors,
@@ -203,6 +208,9 @@ class Tracker:
         return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
 
 
+MOST_TRIED = 5  # largest number of images, those of most circles, in which mistakes in the camera file are looked for
+
+
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
     """Options of :func:`measure`.
@@ -244,9 +252,14 @@ class MeasureResult(Brief):
     intrinsics_held: bool  # whether the intrinsics were taken as exact
     common: np.ndarray  # (m, 6, r) of the poses, see :func:`stcal.sfm.measurement.pose.common_errors`
     searched: int | None = None  # number of images of a sequence that were searched as a whole
+    mistakes: tuple[str, ...] = ()  # in the camera file, each of which explains why poses do not fit
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
+
+    def remedy(self, otherwise: str) -> str:
+        """Returns what to correct where poses do not fit: the camera file, if that explains it."""
+        return f"{' or '.join(self.mistakes)}; give that of these images" if self.mistakes else otherwise
 
 
 @require_arguments
@@ -312,7 +325,7 @@ def measure(
         printed = design.with_faces(printed=True).faces
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
-        remedy = "check target.toml (radii, polarity), camera file, faces.json and the exposure"
+        remedy = result.remedy("check target.toml (radii, polarity), camera file, faces.json and the exposure")
         fault = f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}"
         raise DetectionError("E-MEASURE-NONE", f"{fault}; {remedy}")
     return result
@@ -337,7 +350,37 @@ def measure_labelled(
                 pose = resolved(pose, before.camera_from_target)
             outcomes.append(_outcome(image.name, pose, notes[image.name]))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    return _result_of(outcomes, target, options, prior)
+    result = _result_of(outcomes, target, options, prior)
+    shown = [image.observations for image in images if len(image.observations) >= MIN_CIRCLES]
+    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) >= len(shown):
+        return result
+    return replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
+
+
+def _mistakes(
+    images: Sequence[ImageObservations], camera: Camera, target: TargetCircles, options: PoseOptions
+) -> tuple[str, ...]:
+    """Returns the mistakes in the camera file without which most of the images pass the test of their fit."""
+
+    def misfit(own: Camera) -> float:
+        poses = [measured_pose(image, own, target, options) for image in images]
+        passed = [p.chi2 / chdtri(p.redundancy, FAILED) if isinstance(p, TargetPose) else np.inf for p in poses]
+        return float(np.median(passed))
+
+    def times(k: float) -> Camera:
+        return replace(camera, focal=k * camera.focal, centre=k * (camera.centre + 0.5) - 0.5)
+
+    middle = np.array([camera.width - 1, camera.height - 1]) / 2
+    whole, other = "the camera file is of whole images, and these are cut out of them", not camera.fisheye
+    kind = "fisheye" if other else "perspective"
+    lens = camera.width, camera.height, camera.focal, camera.centre, camera.distortion
+    candidates = [
+        Candidate(whole, lambda: replace(camera, centre=middle)),
+        Candidate(f"the camera file is of a {kind} lens", lambda: Camera(*lens, other), 1),
+        Candidate("the distortion of the camera file is wrong", lambda: replace(camera, distortion=np.zeros(8)), 1),
+        *(Candidate(f"the camera file is of images {1 / k:g} times as wide", partial(times, k), 2) for k in (0.5, 2.0)),
+    ]
+    return tuple(each.words for each, _ in explain(candidates, misfit, 1.0))
 
 
 def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[MeasureResult, np.ndarray]:

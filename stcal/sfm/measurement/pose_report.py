@@ -196,7 +196,7 @@ def summary(result: MeasureResult) -> list[str]:
         )
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     if failed:
-        remedy = "check that camera file, faces.json and images belong together"
+        remedy = result.remedy("check that camera file, faces.json and images belong together")
         lines.append(
             f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
             f"100 000; {remedy}"

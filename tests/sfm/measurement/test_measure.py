@@ -368,6 +368,27 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     assert measured_from([image.select([])], scene.camera, truth).left_out[0].reason == NO_FACE
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda camera: replace(camera, focal=camera.focal / 2, centre=(camera.centre + 0.5) / 2 - 0.5), "half"),
+        (lambda camera: replace(camera, centre=camera.centre + 150), "cut out"),
+        (lambda camera: replace(camera, focal=1.1 * camera.focal), None),
+    ],
+)
+def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
+    rng = np.random.default_rng(2)
+    images = [
+        replace(see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name)
+        for name in "abc"
+    ]
+    true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
+    shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
+    assert measured_from(shifted, true, known.truth).mistakes == ()
+    found = measured_from(shifted, change(true), known.truth).mistakes
+    assert found == () if said is None else said in found[0].replace("0.5 times", "half")
+
+
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):
     """σ stated a hundred times too small; with their own σ the same images pass. Without a face there is an error."""
     words = command(small_dataset, small_run, tmp_path, "--strict")
