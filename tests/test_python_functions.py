@@ -176,7 +176,7 @@ def test_goals_in_the_base(tmp_path):
     )
     one, similar = {"one": flange}, register.register(xyz_a, xyz_b * 1.1, model="similarity")
     refuses("E-ROBOT-POSES-SCENE … none of scene two", locate.goals, results, locate.goal_chain(mount, robot_poses=one))
-    refuses("E-OPTION-MISSING … registration needed", locate.goal_chain)
+    refuses("E-OPTION-MISSING … neither … registration", locate.goal_chain)
     refuses("E-REGISTER-FILE … similarity", locate.goal_chain, registration=similar)
 
 

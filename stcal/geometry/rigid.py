@@ -18,6 +18,7 @@ from scipy.special import chdtrc
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, Brief, ByValue, freeze, frozen
 
+ModelName = Literal["rigid", "similarity", "affine"]
 Order = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components; in tables by the names of columns (``wxyz``), or by their order (``xyzw``)."""
 UNIT_WITHIN = 1e-3
@@ -210,6 +211,12 @@ class Similarity(ByValue):
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError("E-SCALE-VALUE", f"similarity: scale {self.scale}, a positive number needed")
 
+    @classmethod
+    def of(cls, linear: np.ndarray, translation: np.ndarray) -> "Similarity":
+        """Return the similarity of a linear part (3, 3), a rotation times a scale, and a translation (3,)."""
+        scale = float(np.cbrt(np.linalg.det(linear)))
+        return cls(scale, Rigid(linear / scale if scale > 0 else linear, translation))
+
     def matrix(self) -> np.ndarray:
         """Return the homogeneous 4×4 matrix, with the scale in its 3×3 part."""
         m = self.rigid.matrix()
@@ -361,24 +368,48 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
     """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign). ``xyz_a``,
     ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` : (n,)"""
-    return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
+    return Rigid(*align(xyz_a, xyz_b, weights, "rigid"))
 
 
 def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
     """Return a_from_b with scale (Umeyama 1991); arguments and errors as :func:`align_rigid`."""
-    return _align(xyz_a, xyz_b, weights, with_scale=True)
+    return Similarity.of(*align(xyz_a, xyz_b, weights, "similarity"))
 
 
-def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
-    """Return a_from_b with twelve parameters by linear least squares, from four or more points off a plane."""
-    a, b, w = _checked(xyz_a, xyz_b, weights, 4)
-    mean_a, mean_b = w @ a, w @ b
-    root = np.sqrt(w)[:, None]
-    linear, _, _, s = np.linalg.lstsq(root * (b - mean_b), root * (a - mean_a), rcond=None)
-    if s[2] <= 1e-9 * s[0]:
+def align(xyz_a, xyz_b, weights: np.ndarray | None, model: ModelName) -> tuple[np.ndarray, np.ndarray]:
+    """Return linear part (3, 3) and translation (3,) of a_from_b; arguments and errors as :func:`align_rigid`. Affine
+    ones need four points or more off a plane."""
+    a, b, needed = np.asarray(xyz_a, float), np.asarray(xyz_b, float), 4 if model == "affine" else 3
+    if a.shape != b.shape or len(a) < needed:
+        raise DegenerateError("E-POINTS-FEW", f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
+    w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
+    if (w < 0).any() or not w.any():
+        raise DegenerateError("E-ALIGN-WEIGHTS", "alignment: weights are negative or all zero; positive weights needed")
+    if model == "affine" and _rank_below(3, b[w > 0]):
         fault = "alignment: the points are coplanar"
         raise DegenerateError("E-POINTS-COPLANAR", f"{fault}; an affine transform needs points off the plane")
-    return Affine(linear.T, mean_a - linear.T @ mean_b)
+    if _rank_below(2, a[w > 0]) or _rank_below(2, b[w > 0]):
+        raise DegenerateError("E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line needed")
+    (linear,), (translation,) = alignments(a[None], b[None], w / w.sum(), model)
+    return linear, translation
+
+
+def alignments(
+    xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray, model: ModelName
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return linear parts (s, 3, 3) and translations (s, 3) of a_from_b for sets of points (s, n, 3) with weights (n,)
+    of sum 1. Those of degenerate sets are finite and wrong."""
+    mean_a, mean_b = weights @ xyz_a, weights @ xyz_b
+    a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
+    weighted = weights[:, None] * a
+    cross = np.swapaxes(weighted, 1, 2) @ b
+    if model == "affine":
+        linear = cross @ np.linalg.pinv((np.swapaxes(b, 1, 2) * weights) @ b, hermitian=True)
+    else:
+        linear, product = best_rotations(cross)
+        if model == "similarity":
+            linear = linear * (product / np.maximum(np.einsum("snk,snk,n->s", b, b, weights), 1e-300))[:, None, None]
+    return linear, mean_a - (linear @ mean_b[:, :, None])[:, :, 0]
 
 
 def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -390,36 +421,14 @@ def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (u * sign[..., None, :]) @ vt, (s * sign).sum(-1)
 
 
-def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points as arrays, and the weights normalised to sum 1; refuse too few points and invalid weights."""
-    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
-    if a.shape != b.shape or len(a) < needed:
-        raise DegenerateError("E-POINTS-FEW", f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
-    w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
-    if (w < 0).any() or not w.any():
-        raise DegenerateError("E-ALIGN-WEIGHTS", "alignment: weights are negative or all zero; positive weights needed")
-    return a, b, w / w.sum()
-
-
-def _collinear(centred: np.ndarray) -> bool:
+def _rank_below(rank: int, points: np.ndarray) -> bool:
+    """Return whether points (n, 3) lie in fewer dimensions than ``rank``."""
+    centred = points - points.mean(0)
     values = np.linalg.eigvalsh(centred.T @ centred)
-    if values[1] > 1e-12 * values[2]:  # clear without the SVD, which is slow for a million points
+    if values[3 - rank] > 1e-12 * values[2]:  # clear without the SVD, which is slow for a million points
         return False
     s = np.linalg.svd(centred, compute_uv=False)
-    return len(s) < 2 or s[1] <= 1e-9 * s[0]
-
-
-def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
-    a, b, w = _checked(xyz_a, xyz_b, weights, 3)
-    mean_a, mean_b = w @ a, w @ b
-    da, db = a - mean_a, b - mean_b
-    for points in (da, db):
-        if _collinear(points[w > 0]):
-            fault = "alignment: the points are collinear"
-            raise DegenerateError("E-POINTS-COLLINEAR", f"{fault}; points off the line needed")
-    rotation, product = best_rotations((w[:, None] * da).T @ db)
-    scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0
-    return Similarity(scale, Rigid(rotation, mean_a - scale * rotation @ mean_b))
+    return len(s) < rank or s[rank - 1] <= 1e-9 * s[0]
 
 
 class ImageFit:

@@ -255,16 +255,11 @@ def goal_chain(
     Raises InputError: neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not
     needed, the registration is not rigid, or a file does not follow ``data_layout.md``.
     """
+    two = "of --hand-eye and --registration, which lead to the robot's base"
     if hand_eye is not None and registration is not None:
-        both = f"--hand-eye {_named('hand-eye', hand_eye)}, --registration {_named('registration', registration)}"
-        raise InputError("E-OPTION-CONFLICT", f"{both}: both lead to the base; give one")
-    if hand_eye is None and robot_poses is not None:
-        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
+        raise InputError("E-OPTION-CONFLICT", f"goals: both {two}; give one")
     if hand_eye is None and registration is None:
-        links = "--hand-eye or --registration"
-        if offset is not None:
-            raise InputError("E-OPTION-NEEDS", f"--offset: only with {links}, which lead from the camera to the robot")
-        raise InputError("E-OPTION-MISSING", f"goals: {links} needed, which lead to the robot's base")
+        raise InputError("E-OPTION-MISSING", f"goals: neither {two}; give one")
     if hand_eye is None:
         moving, mount, source = False, _registered(registration), _named("registration", registration)
     else:

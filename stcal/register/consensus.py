@@ -30,11 +30,11 @@ from stcal.geometry.arrays import OF_POINT, first_fault
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import (
     Affine,
+    ModelName,
     Rigid,
     Similarity,
-    align_affine,
-    align_rigid,
-    align_similarity,
+    align,
+    alignments,
     best_rotations,
     skew,
 )
@@ -48,12 +48,11 @@ SHOWN = 5  # number of rows that a message names
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``sample`` : least number of point pairs; ``align`` : fit to points b and a with weights (n,)."""
+    """``sample`` : least number of point pairs."""
 
-    name: str
+    name: ModelName
     parameters: int
     sample: int
-    align: Callable[[np.ndarray, np.ndarray, np.ndarray], Transform]
 
     @property
     def needed(self) -> int:
@@ -64,13 +63,14 @@ class Model:
         """Returns the redundancy of a fit to n point pairs."""
         return 3 * n - self.parameters
 
+    def transform(self, found: Affine) -> Transform:
+        """Returns a transform of this model as what it is."""
+        kind = {"rigid": Rigid, "similarity": Similarity.of, "affine": Affine}[self.name]
+        return kind(found.linear, found.translation)
 
-RIGID, SIMILARITY, AFFINE = (
-    Model("rigid", 6, 3, align_rigid),
-    Model("similarity", 7, 3, align_similarity),
-    Model("affine", 12, 4, align_affine),
-)
-MODELS = {model.name: model for model in (RIGID, SIMILARITY, AFFINE)}
+
+RIGID, SIMILARITY, AFFINE = Model("rigid", 6, 3), Model("similarity", 7, 3), Model("affine", 12, 4)
+MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, AFFINE)}
 
 
 def linear_part(transform: Transform) -> np.ndarray:
@@ -78,9 +78,9 @@ def linear_part(transform: Transform) -> np.ndarray:
     return transform.matrix()[:3, :3]
 
 
-def rotation_of(transform: Transform) -> np.ndarray:
+def rotation_of(transform: Affine) -> np.ndarray:
     """Returns the rotation (3, 3) nearest to the linear part."""
-    return best_rotations(linear_part(transform))[0]
+    return best_rotations(transform.linear)[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,20 +145,20 @@ class Problem:
             return np.einsum("nij,ni...->nj...", np.linalg.cholesky(self.precision), values)
         return values * np.sqrt(self.precision).reshape(-1, *[1] * (values.ndim - 1))
 
-    def fit(self) -> Transform:
+    def fit(self) -> Affine:
         """Returns the b_from_a of least Σ rᵢᵀ Pᵢ rᵢ. Raises DegenerateError; ConvergenceError with covariances."""
-        start = self.model.align(self.xyz_b, self.xyz_a, self.weights)
+        start = Affine(*align(self.xyz_b, self.xyz_a, self.weights, self.model.name))
         if self.precision.ndim == 1:
             return start
         origin = self.weights @ self.xyz_a / self.weights.sum()
 
-        def equations(transform: Transform) -> NormalEquations:
+        def equations(transform: Affine) -> NormalEquations:
             force = np.einsum("nrs,ns->nr", self.precision, self.residuals(transform))
             pull = np.einsum("nr,nk->rk", force, _homogeneous(self.xyz_a - origin))
             gradient = -_motions(self.model, transform).T @ pull.ravel()
             return NormalEquations(float(self.squares(transform).sum()), self._normal(transform, origin), gradient)
 
-        fitted = minimise(start, equations, lambda transform, step: _moved(transform, origin, step))
+        fitted = minimise(start, equations, lambda transform, step: _moved(self.model, transform, origin, step))
         return fitted.required("registration", "are the covariances true, or some of them huge?").state
 
     def unit_covariance(self, transform: Transform) -> np.ndarray:
@@ -236,21 +236,6 @@ def problem_of(
     return Problem(model, xyz_a, xyz_b, precision, float(np.sqrt(variance)), lines)
 
 
-def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits s minimal samples (s, m, 3) at once: linear parts (s, 3, 3), translations (s, 3) of b_from_a. Results for
-    degenerate samples are finite and wrong."""
-    mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
-    a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
-    cross = np.swapaxes(b, 1, 2) @ a
-    if model == AFFINE:
-        linear = cross @ np.linalg.pinv(np.swapaxes(a, 1, 2) @ a, hermitian=True)
-    else:
-        linear, product = best_rotations(cross)
-        if model == SIMILARITY:
-            linear = linear * (product / np.maximum((a**2).sum((1, 2)), 1e-300))[:, None, None]
-    return linear, mean_b - (linear @ mean_a[:, :, None])[:, :, 0]
-
-
 def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
     """Returns the derivative (n, 3, p) of b_from_a a by the parameters of :meth:`Problem.unit_covariance` about a point
     of a, for points (n, 3) minus that point."""
@@ -273,21 +258,14 @@ def _motions(model: Model, transform: Transform) -> np.ndarray:
     return motions.reshape(model.parameters, 12).T
 
 
-def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
+def _moved(model: Model, transform: Affine, origin: np.ndarray, step: np.ndarray) -> Affine:
     """Returns the transform after a step of the parameters about ``origin``."""
-    there = transform @ origin
-    if isinstance(transform, Affine):
-        rows = step.reshape(3, 4)
-        linear = transform.linear + rows[:, :3]
-        return Affine(linear, there + rows[:, 3] - linear @ origin)
-    scale, rigid = (1.0, transform) if isinstance(transform, Rigid) else (transform.scale, transform.rigid)
-    scale *= 1 + step[6:].sum()
-    if scale <= 0:
-        fault = "registration: the scale is not determined"
-        raise DegenerateError("E-REGISTER-SCALE", f"{fault}; are the covariances true?")
-    rotation = Rigid.exp([*step[:3], 0, 0, 0]).rotation @ rigid.rotation
-    moved = Rigid(rotation, there + step[3:6] - scale * rotation @ origin)
-    return moved if isinstance(transform, Rigid) else Similarity(scale, moved)
+    change = (_motions(model, transform) @ step).reshape(3, 4)
+    linear, there = transform.linear + change[:, :3], transform @ origin + change[:, 3]
+    if model != AFFINE:
+        rotation, product = best_rotations(linear)
+        linear = rotation if model == RIGID else rotation * product / 3
+    return Affine(linear, there - linear @ origin)
 
 
 WIDE = 8.0  # threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13
@@ -406,7 +384,8 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
 
 def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensus | None) -> Consensus | None:
     """Returns the best of the refined samples and of ``best``."""
-    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
+    even = np.full(samples.shape[1], 1 / samples.shape[1])
+    linear, translation = alignments(problem.xyz_b[samples], problem.xyz_a[samples], even, problem.model.name)
     residual = problem.xyz_b.T - translation[:, :, None]
     residual -= (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
     if problem.precision.ndim == 3:
@@ -445,7 +424,7 @@ BY_CHANCE = 0.01  # largest number of false alarms of a consensus that is accept
 class Fitted:
     """A transform and the points that agree on it."""
 
-    transform: Transform
+    transform: Affine
     inliers: np.ndarray  # (n,)
     sigma: float  # per axis, mm, of a point of mean σ
     threshold: float  # likewise; may be infinite
@@ -530,7 +509,7 @@ def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samp
 
 
 def _chosen(
-    problem: Problem, transform: Transform, square: np.ndarray, used: np.ndarray, sigma: float
+    problem: Problem, transform: Affine, square: np.ndarray, used: np.ndarray, sigma: float
 ) -> tuple[float, np.ndarray]:
     """Returns the threshold at the middle of the points, mm, and the mask of the points that pass the test."""
     redundancy, beyond = problem.model.redundancy(int(used.sum())), CLEAN_SETS_WITH_OUTLIER / len(problem)
@@ -550,7 +529,9 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     mm, by default the inliers' along principal axes: Moisan & Stival's (2004) (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over
     k; α(r) is the share of a cube of half side r."""
     size, every = problem.model.sample, len(problem)
-    rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
+    rows = np.arange(every)
+    if every > LEVERAGE_UP_TO:  # at random, as wrong rows may recur in step
+        rows = np.random.default_rng(0).choice(rows, LEVERAGE_UP_TO, replace=False)
     share, count, k = problem[rows], len(rows), np.arange(size + 1, len(rows) + 1)
     if not len(k):
         return 0.0

@@ -14,7 +14,7 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register import consensus
-from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem, Transform, linear_part
+from stcal.register.consensus import AFFINE, MODELS, RIGID, Fitted, Model, Problem
 from stcal.register.registered import Registration
 from stcal.row_order import Change, change_along
 
@@ -45,7 +45,7 @@ LEVEL, IN_ORDER = 0.01, 10_000
 """Probability that sound points seem to move along their rows; largest number examined, as more are clouds."""
 
 
-def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
+def moved_meanwhile(problem: Problem, transform: Affine) -> Change | None:
     """Returns the jump or drift of one frame against the other along the order of the rows; None if there is none
     beyond chance, or the frames are bent and it explains no bend."""
     if len(problem) > IN_ORDER:
@@ -101,7 +101,7 @@ class Shifted:
     by_mm: np.ndarray
 
 
-def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
+def shifted_rows(problem: Problem, transform: Affine) -> Shifted | None:
     """Returns the rows that are shifted together; None if there is no such group, a bent frame, or too few points."""
     count = len(problem)
     plain = problem.residuals(transform)
@@ -262,12 +262,12 @@ class Explained:
     model than was asked for."""
 
     problem: Problem
-    transform: Transform
+    transform: Affine
     sigma_mm: float
     note: str = ""
 
 
-def explained(problem: Problem, transform: Transform, sigma_mm: float) -> Explained:
+def explained(problem: Problem, transform: Affine, sigma_mm: float) -> Explained:
     """Returns the points with the narrowest wider model that explains them better beyond chance, or as given."""
     narrow, transform_of, sigma = problem, transform, sigma_mm
     for model in list(MODELS.values())[list(MODELS).index(problem.model.name) + 1 :]:
@@ -287,7 +287,7 @@ def explained(problem: Problem, transform: Transform, sigma_mm: float) -> Explai
             narrow, transform_of, sigma = candidate, fitted, float(np.sqrt(max(after, 0) / redundancy))
     if narrow is problem:
         return Explained(problem, transform, sigma_mm)
-    scales = np.linalg.svd(linear_part(transform_of), compute_uv=False)
+    scales = np.linalg.svd(transform_of.linear, compute_uv=False)
     if narrow.model == AFFINE:
         said = (
             f"{', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one instrument is "

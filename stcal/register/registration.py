@@ -22,7 +22,7 @@ from stcal.geometry.rigid import Affine
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register import consensus, doubts
-from stcal.register.consensus import MODELS, RIGID, Fitted, Model, Problem, Transform, problem_of
+from stcal.register.consensus import MODELS, RIGID, Fitted, Model, Problem, problem_of
 from stcal.register.registered import Alternative, Registration, held_out
 
 
@@ -191,7 +191,9 @@ def register(
         rotations = [consensus.rotation_of(each.transform) for each in (fitted, second)]
         apart = np.linalg.norm(fitted.transform @ problem.xyz_a - second.transform @ problem.xyz_a, axis=1)
         turn = float(Rotation.from_matrix(rotations[0] @ rotations[1].T).magnitude())
-        alternative = Alternative(second.transform, np.flatnonzero(second.inliers), rms(apart), turn)
+        alternative = Alternative(
+            problem.model.transform(second.transform), np.flatnonzero(second.inliers), rms(apart), turn
+        )
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         change = doubts.moved_meanwhile(problem, fitted.transform)
@@ -213,7 +215,7 @@ def register(
     result = Registration(
         model=problem.model.name,
         method=method,
-        b_from_a=fitted.transform,
+        b_from_a=problem.model.transform(fitted.transform),
         covariance=covariance,
         inliers=fitted.inliers,
         residuals=problem.residuals(fitted.transform),
@@ -327,7 +329,7 @@ FEW, SPHERICAL = 16, 0.1
 sets of 16 points with three times the noise along one axis."""
 
 
-def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Transform, Transform] | None:
+def two_groups(problem: Problem, rng: np.random.Generator) -> tuple[Affine, Affine] | None:
     """Returns the transforms of the larger group of points and of the other; None if one transform explains all of them
     as well, or their places determine the group."""
     n, model = len(problem), problem.model
@@ -377,7 +379,7 @@ def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> floa
     return float((t[:, 0] * log_ratio + moments.sum(1)).min())
 
 
-def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Transform, Transform]] | None:
+def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Affine, Affine]] | None:
     """Returns the mask (n,) of one group, and the transforms of both; None if one becomes too small."""
     model, n = problem.model, len(problem)
     core = consensus.search(problem, consensus.by_share(model, n), rng)
@@ -403,9 +405,7 @@ def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, t
     return best
 
 
-def covariance_of(
-    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
-) -> tuple[np.ndarray, bool, float]:
+def covariance_of(inliers: Problem, b_from_a: Affine, sigma: float, threshold: float) -> tuple[np.ndarray, bool, float]:
     """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
 
     A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``

@@ -91,9 +91,9 @@ def test_limits_are_options(run):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["--robot-poses", "x.csv"], "only with --hand-eye"),
-        (["--offset", "x.json"], "only with --hand-eye or --registration"),
-        (["--hand-eye", "x.json", "--registration", "y.json"], "both lead to the base"),
+        (["--robot-poses", "x.csv"], "neither of --hand-eye"),
+        (["--offset", "x.json"], "neither of --hand-eye and --registration"),
+        (["--hand-eye", "x.json", "--registration", "y.json"], "both of --hand-eye and --registration"),
         (["--flip-odds", "2"], "odds between 0 and 1"),
         (["--s-dis", "3"], "S_dis 3"),
         (["--moved-px", "-1"], "moved_px -1"),
