@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from stcal.adjust.blocks import Block, Huber, Vector
@@ -19,7 +21,7 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Normal, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
-from stcal.geometry.robust import HUBER, huber_cost, robust_sigma
+from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
 from stcal.labels import Label
 from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, WorldModel, assemble
 from stcal.sfm.mapping import incremental
@@ -40,6 +42,11 @@ SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 the distance of the faces."""
 MOST_VOTES = 250  # most images that vote on how two faces lie; time and memory grow with their square
 LEAST_SIGMA_PX = 0.05  # σ that print, lens and detector leave to any corner
+LEAST_PAIRS, ROBUST_SIZES = 2, 10
+"""Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
+MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
+"""Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
+LEAST_SIGMA_OFF = 0.02  # σ of such a logarithm that the reflections of views and a rough camera leave to any
 LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
 BETTER = 0.2  # share by which another pose of a face must fit its corners better
 PASSES, ROBUST_ROUNDS = 3, 3
@@ -192,24 +199,94 @@ def _pairs(views: _FaceViews) -> dict[tuple[int, int], list[tuple[int, int]]]:
     return dict(sorted(by_pair.items()))
 
 
+class _Relative:
+    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views; of at most ``MOST_VOTES``
+    pairs of views, evenly drawn."""
+
+    def __init__(self, pairs: list[tuple[int, int]], views: _FaceViews):
+        pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
+        a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
+        back, place = np.swapaxes(views.poses.rotation[a], 1, 2), views.poses.translation[..., None]
+        self.rotation = back @ views.poses.rotation[b]  # (4p, 3, 3)
+        # (4p, 3) of the origins, from the camera, in the axes of a
+        self.a_place, self.b_place = ((back @ place[k])[..., 0] for k in (a, b))
+        self.of_pair = np.repeat(np.arange(len(pairs)), 4)
+        cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
+        self.excess = (cost - cost.min(1, keepdims=True)).ravel()  # over that of the best pose of the image
+        cosine = (np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2
+        self.turned_alike = np.arccos(np.clip(cosine, -1, 1)) < SAME_TURN_RAD  # (4p, 4p)
+
+    def best(self, agrees: np.ndarray) -> tuple[int, int]:
+        """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
+        votes = agrees.reshape(len(agrees), -1, 4).any(2).sum(1)
+        # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
+        best = int(np.lexsort((self.excess, -votes))[0])
+        return best, int(votes[best])
+
+
 def _edge(pairs: list[tuple[int, int]], views: _FaceViews) -> tuple[Rigid, int]:
-    """Returns a_from_b of two faces as the images see it, and the number of images that agree on it: of the four poses
-    of each pair of views, of which at most ``MOST_VOTES`` are evenly drawn, that with which most images agree."""
-    pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
-    a, b = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)]).T
-    a_from_b = views.poses[a].inverse() @ views.poses[b]  # (4p,)
-    rotation, translation = a_from_b.rotation, a_from_b.translation
-    cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
-    excess = (cost - cost.min(1, keepdims=True)).ravel()  # over that of the best pose of the image
-    cosine = (np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2
+    """Returns a_from_b of two faces as the images see it, and the number of images that agree on it."""
+    poses = _Relative(pairs, views)
+    translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
-    agrees = (np.arccos(np.clip(cosine, -1, 1)) < SAME_TURN_RAD) & (apart < SAME_PLACE)
-    votes = agrees.reshape(len(agrees), -1, 4).any(2).sum(1)
-    # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
-    best = int(np.lexsort((excess, -votes))[0])
+    agrees = poses.turned_alike & (apart < SAME_PLACE)
+    best, votes = poses.best(agrees)
     near = np.flatnonzero(agrees[best])
-    mean = Rotation.from_matrix(rotation[near]).mean().as_matrix()
-    return Rigid(mean, np.median(translation[near], axis=0)), int(votes[best])
+    mean = Rotation.from_matrix(poses.rotation[near]).mean().as_matrix()
+    return Rigid(mean, np.median(translation[near], axis=0)), votes
+
+
+def wrong_sizes(corners: BodyCorners, camera: Camera) -> tuple[dict[int, float], int]:
+    """Returns true over stated size of faces whose size contradicts those of most others, by index of the face, and the
+    number of the others that were compared. Too large by q, a face seems farther by q: face b is at the same place d in
+    the frame of a in all images, q R_aᵀ t_b − R_aᵀ t_a = d."""
+    views = _FaceViews(corners, camera)
+    ratios: list[tuple[int, int, float, float]] = []
+    for (a, b), pairs in _pairs(views).items():
+        if len(pairs) < LEAST_PAIRS:
+            continue
+        poses = _Relative(pairs, views)
+        near = np.flatnonzero(poses.turned_alike[poses.best(poses.turned_alike)[0]])
+        near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
+        if len(near) < LEAST_PAIRS:
+            continue
+        a_place, b_place, weight = poses.a_place[near], poses.b_place[near], np.ones(len(near))
+        for _ in range(ROBUST_SIZES):
+            total = weight.sum()
+            u, v = (place - weight @ place / total for place in (b_place, a_place))
+            square = float(weight @ (u**2).sum(1))
+            ratio = float(weight @ (u * v).sum(1)) / square
+            length = np.linalg.norm(ratio * u - v, axis=1)
+            weight = huber_weights(length, HUBER * max(robust_sigma(length, 3), 1e-12))
+        freedom = max(3 * total - 4, 1.0)
+        variance = float(weight @ length**2) / freedom
+        if ratio > 0:
+            ratios.append((a, b, np.log(ratio), np.sqrt(variance / square) / ratio))
+    off = _off(ratios, len(corners.faces)) if ratios else {}
+    return off, len({face for a, b, *_ in ratios for face in (a, b)}) - len(off)
+
+
+def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
+    """Factors of faces that differ from the median of those linked to them, from log ratios (a, b, log, σ)."""
+    a, b, value, sigma = (np.array(each) for each in zip(*ratios, strict=True))
+    rows = np.eye(faces)[b] - np.eye(faces)[a]
+    sigma = np.hypot(sigma, LEAST_SIGMA_OFF)
+    weight, logs, spread = sigma**-2, np.zeros(faces), 1.0
+    for _ in range(ROBUST_SIZES):
+        away = np.linalg.pinv((rows.T * weight) @ rows)
+        logs = away @ ((rows.T * weight) @ value)
+        length = np.abs(rows @ logs - value) / sigma
+        spread = max(robust_sigma(length, 1), 1.0)
+        weight = huber_weights(length, HUBER * spread) / sigma**2
+    off: dict[int, float] = {}
+    linked = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(faces, faces)), directed=False)[1]
+    for component in np.unique(linked[np.concatenate([a, b])]):
+        own = np.flatnonzero(linked == component)
+        away_of = logs[own] - np.median(logs[own])
+        sure = SURE_SIGMAS * spread * np.sqrt(np.diag(away)[own])
+        far = np.flatnonzero(np.abs(away_of) > np.maximum(MOST_OFF, sure))
+        off |= {int(own[k]): float(np.exp(away_of[k])) for k in far}
+    return off
 
 
 def _images(
@@ -357,6 +434,7 @@ def place_with_camera(
 ) -> PlacedBody:
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
     corners = BodyCorners(observations, faces)
+    _require_sizes(corners, camera)
     body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
     return PlacedBody(body, corners, camera)
 
@@ -368,6 +446,7 @@ def place_and_find_camera(
     corners = BodyCorners(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
+    _require_sizes(corners, first)
     bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
     best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
     if best is None:
@@ -380,6 +459,24 @@ def place_and_find_camera(
     with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
         best = settled_body(best, corners, basis, prior, lens)
     return PlacedBody(best, corners, unknown_lens(best.camera))
+
+
+def _require_sizes(corners: BodyCorners, camera: Camera) -> None:
+    """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
+    wrong, alike = wrong_sizes(corners, camera)
+    if not wrong:
+        return
+    names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
+    if alike < len(names):
+        told = f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+        told += f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states"
+        remedy = "measure the side of each print, and correct it"
+    else:
+        each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
+        told = f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other "
+        told += "faces agree with one another"
+        remedy = "measure the side of its print, and correct it"
+    raise MappingError("E-BODY-SIZES", f"target: {told}; {remedy}")
 
 
 def _with_focal_length(corners: BodyCorners, camera: Camera) -> Body | None:
