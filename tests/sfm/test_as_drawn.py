@@ -37,13 +37,12 @@ def found(size: float = 1.0, seed: int = 1) -> dict[str, Rigid]:
     }
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_body_as_drawn_says_nothing(seed):
-    assert not_as_drawn(found(seed=seed), CUBE) == []
+def test_a_body_as_drawn_says_nothing():
+    assert [not_as_drawn(found(seed=seed), CUBE) for seed in range(5)] == [[]] * 5
     assert not_as_drawn({"1": Rigid()}, CUBE) == []
 
 
-def test_another_size_and_exchanged_faces_are_named():
+def test_sizes_and_faces_that_are_not_as_drawn_are_named():
     [size] = not_as_drawn(found(0.1), CUBE)
     assert re.match(r"not as drawn: faces are 0\.(1|09\d|10) times as far from one another as their rough_pose", size)
     poses = found()
@@ -55,6 +54,11 @@ def test_another_size_and_exchanged_faces_are_named():
     [turned] = not_as_drawn(poses | {"4": poses["4"] @ turn}, CUBE)
     assert "face 4 is turned by 9" in turned or "face 4 is turned by 8" in turned
     assert "exchanged" not in turned
+    one, other = (poses["4"] @ Rigid.exp([np.radians(turned), 0, 0, 0, 0, 0]) for turned in (30.0, 60.0))
+    assert cause_of_drawing(poses | {"4": one}, CUBE) is None
+    cause = cause_of_drawing(poses | {"4": other}, CUBE)  # it is on another side
+    assert (cause.verdict, cause.names) == ("failed", ("4",))
+    assert "face 4 is not where its rough_pose has it" in cause.title
 
 
 def seen(group: str, *faces: str) -> list[ImageObservations]:
@@ -62,17 +66,6 @@ def seen(group: str, *faces: str) -> list[ImageObservations]:
     n = len(labels)
     empty = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
     return [ImageObservations(f"{group}/{i}", group, labels, *empty) for i in range(3)]
-
-
-@pytest.mark.parametrize(("turned", "named"), [(30.0, False), (60.0, True)])
-def test_a_face_on_another_side_is_not_the_one_drawn(turned, named):
-    faces = found(seed=1) | {}
-    faces["4"] = faces["4"] @ Rigid.exp([np.radians(turned), 0, 0, 0, 0, 0])
-    cause = cause_of_drawing(faces, CUBE)
-    assert bool(cause) is named
-    if cause:
-        assert (cause.verdict, cause.names) == ("failed", ("4",))
-        assert "face 4 is not where its rough_pose has it" in cause.title
 
 
 def test_groups_that_show_other_faces_than_their_names_say():

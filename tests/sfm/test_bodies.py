@@ -38,7 +38,7 @@ from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import FULL, sampled
-from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
+from tests.outcome import COMPUTATION, assert_error, refuses
 from tests.support.image_poses import pose_error
 
 pytestmark = pytest.mark.slow
@@ -65,7 +65,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_faces_of_boards_and_tags_are_read_and_written(tmp_path):
+def test_faces_of_boards_and_tags_are_read_and_written_with_their_rough_poses(tmp_path):
     target = load_target(written(tmp_path, TARGET))
     board, tags = target.faces
     assert (len(board.ids), board.ids[5], board.sigma_mm, board.outward) == (16, "1.1", 0.01, -1)
@@ -76,9 +76,6 @@ def test_faces_of_boards_and_tags_are_read_and_written(tmp_path):
     for face, same in zip(target.faces, again.faces, strict=True):
         assert (face.ids, face.sigma_mm) == (same.ids, same.sigma_mm)
         np.testing.assert_allclose(face.xy_mm, same.xy_mm, atol=1e-9)
-
-
-def test_rough_poses_of_printed_faces_are_kept(tmp_path):
     cube = tag_cube(60)
     again = load_target(written(tmp_path, target_toml(cube)))
     for face, same in zip(cube.faces, again.faces, strict=True):
@@ -87,6 +84,7 @@ def test_rough_poses_of_printed_faces_are_kept(tmp_path):
         )
         outward = -face.rough_target_from_face.rotation[:, 2]
         assert outward @ face.rough_target_from_face.translation == pytest.approx(30)
+    refuses("E-TARGET-PRINTED … face 0 … stcal-sfm run", load_target, written(tmp_path, TARGET), printed=False)
 
 
 @pytest.mark.parametrize(
@@ -104,23 +102,19 @@ def test_rough_poses_of_printed_faces_are_kept(tmp_path):
     ],
 )
 def test_mistakes_in_printed_faces_are_named(tmp_path, change, error):
-    with fails_with(error):
-        load_target(written(tmp_path, TARGET.replace(*change)))
+    refuses(error, load_target, written(tmp_path, TARGET.replace(*change)))
 
 
-def test_commands_without_such_faces_say_so(tmp_path):
-    with fails_with("E-TARGET-PRINTED … face 0 … stcal-sfm run"):
-        load_target(written(tmp_path, TARGET), printed=False)
-
-
-def test_circles_without_a_board_need_a_camera(tmp_path):
-    (tmp_path / "images").mkdir()
-    Image.new("L", (640, 480)).save(tmp_path / "images" / "1.png")
+def test_circles_without_a_board_need_a_camera_and_tags_take_no_options_for_circles(tmp_path):
+    images, out = tmp_path / "images", tmp_path / "r"
+    images.mkdir()
+    Image.new("L", (640, 480)).save(images / "1.png")
     distance = '\nscale = [{ from = "1:1", to = "1:2", mm = 60, sigma_mm = 0.1 }]\n'
     head, faces = target_toml(reference_target()).split("[[face]]", 1)
     target = written(tmp_path, f"{head}{distance}[[face]]{faces}")
-    with fails_with("E-CAMERA-NEEDED … --camera"):
-        pipeline.run(tmp_path / "images", None, tmp_path / "r", target)
+    refuses("E-CAMERA-NEEDED … --camera", pipeline.run, images, None, out, target)
+    for option in (RunOptions(solve="paper"), RunOptions(board_only=True)):
+        refuses("E-OPTION-CONFLICT … --", pipeline.run, images, None, out, tag_cube(60), None, option)
 
 
 def observed(target, count: int, seed: int, distance_mm: float = 300):
@@ -266,12 +260,15 @@ def test_each_face_is_seen_often_and_squarely(target, images, seed):
     assert scene.hardly_seen() == ""
 
 
-def test_faces_that_are_hardly_seen_are_named():
+def test_faces_that_are_hardly_seen_and_the_distance_that_a_body_needs_are_named():
     scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(2, 300.0, pose_sigma_mm=0, pose_sigma_deg=0))
     shown = [face.id for image in range(2) for face in scene.faces_in_view(image)]
     for face in scene.target.faces:
         assert f"{face.id} ({shown.count(face.id)} of 2 images" in scene.hardly_seen()
     assert "hardly seen: face" in plan_text(plan(PlanOptions(4, distance_mm=300, width=900), THREE), "")
+    near = tag_cube(60), body_camera(900), BodyOptions(1, 60.0)
+    refuses("E-SIMULATE-BODY … 60 mm … 182 mm", make_body_scene, *near)
+    make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 182.5))
 
 
 def test_what_is_forecast_is_what_is_simulated():
@@ -288,12 +285,6 @@ def test_what_is_forecast_is_what_is_simulated():
         seen = np.array([scene.camera.project(pose @ points) for pose in scene.camera_from_target])
         assert (seen > 0).all()
         assert (seen < [900, 600]).all()
-
-
-def test_the_distance_that_a_body_needs_is_named():
-    with fails_with("E-SIMULATE-BODY … 60 mm … 182 mm"):
-        make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 60.0))
-    make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 182.5))
 
 
 def test_more_images_and_a_known_distance_help_a_planned_body():
@@ -315,17 +306,14 @@ def test_straight_lines_along_curved_edges_meet_beside_the_corners():
     assert np.abs(shift_by_curves(square, replace(camera, distortion=np.zeros(8)))).max() < 1e-9
 
 
-@pytest.mark.parametrize("body", ["cube", "dodecahedron"])
-def test_neighbouring_faces_of_a_designed_body_share_their_corners(body):
-    target = tag_body(body, "60", "APRILTAG_36h11", 3)
-    corners = np.concatenate([f.rough_target_from_face @ np.pad(f.outline_mm, ((0, 0), (0, 1))) for f in target.faces])
-    apart = np.linalg.norm(corners[:, None] - corners, axis=2)
-    assert (np.sort(apart, axis=1)[:, :3] < 1e-5).all()  # three faces meet in each corner
-    assert np.sort(apart, axis=1)[:, 3].min() > 10
-    assert "one sheet of A" in net_text(target)
-
-
-def test_a_body_may_have_tags_on_some_faces():
+def test_neighbouring_faces_of_a_designed_body_share_their_corners_and_some_may_have_no_tags():
+    for body in ("cube", "dodecahedron"):
+        target = tag_body(body, "60", "APRILTAG_36h11", 3)
+        corners = [face.rough_target_from_face @ np.pad(face.outline_mm, ((0, 0), (0, 1))) for face in target.faces]
+        apart = np.sort(np.linalg.norm(np.concatenate(corners)[:, None] - np.concatenate(corners), axis=2), axis=1)
+        assert (apart[:, :3] < 1e-5).all()  # three faces meet in each corner
+        assert apart[:, 3].min() > 10
+        assert "one sheet of A" in net_text(target)
     five = tag_body("cube", "62", "APRILTAG_36h11", 3, "1,2,3,4,5")
     assert [face.id for face in five.faces] == ["1", "2", "3", "4", "5"]
     assert net_text(five) == "net to fold, 186 × 186 mm: one sheet of A3"
@@ -462,11 +450,3 @@ def test_a_real_cube_of_charuco_boards(tmp_path):
     beside = angles[(angles > 45) & (angles < 135)]
     assert len(beside) == 24
     assert np.abs(beside - 90).max() < 1.5
-
-
-@pytest.mark.parametrize("option", [{"solve": "paper"}, {"board_only": True}])
-def test_options_for_circles_are_refused(tmp_path, option):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images/a.png").write_bytes(b"")
-    with fails_with("E-OPTION-CONFLICT … --"):
-        pipeline.run(tmp_path / "images", None, tmp_path / "r", tag_cube(60), None, RunOptions(**option))

@@ -67,12 +67,6 @@ def designs(tmp_path):
     return "--target", tmp_path / "target.toml", "--board", tmp_path / "board.toml"
 
 
-def test_a_design_of_ones_own_is_planned_before_any_photograph(command, designs):
-    code, out, _ = command("plan", *designs, "--images", 3, "--width", 1200)
-    assert code == 0
-    assert all(face.id in out for face in second_design()[0].faces[:2])
-
-
 def test_simulate_with_the_camera_of_a_file(command, designs, tmp_path):
     camera = tmp_path / "cameras.txt"
     camera.write_text("1 SIMPLE_RADIAL 400 300 430 203 148 -0.05\n")

@@ -21,7 +21,7 @@ from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 BOARDS = {
     "aprilgrid": AprilGridDesign(3, 4, 40.0, 0.25, 2),
@@ -149,30 +149,23 @@ def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was(tmp_path, text)
     np.testing.assert_allclose(again.xy_mm(), flat.xy_mm(), atol=1e-12)
 
 
-def test_a_gap_in_metres_is_no_ratio(tmp_path):
+def test_a_gap_in_metres_is_no_ratio_and_the_published_method_needs_dots(tmp_path):
     text = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.0264\n"
-    with fails_with("E-BOARD-SPACING … tagSpacing 0.0264 … 0.1 … 0.3"):
-        load_board(written(tmp_path, text))
+    refuses("E-BOARD-SPACING … tagSpacing 0.0264 … 0.1 … 0.3", load_board, written(tmp_path, text))
+    for option in ("--solve paper", "--compare paper"):
+        board = CornerBoard.of(BOARDS["chessboard"])
+        refuses(f"E-OPTION-CONFLICT … {option} … squares or tags", require_dots, board, option)
 
 
-def test_points_are_numbered_by_rows_and_columns_of_equal_places():
+def test_points_are_numbered_by_rows_and_columns_and_both_ways_where_a_board_looks_the_same_turned():
     board = CornerBoard.of(AprilGridDesign(2, 3, 40.0, 0.25, 2))
     assert (board.rows, board.columns) == (4, 6)
     # The bottom left tag of Kalibr has its corners at (0, 0) to (40, -40) mm; a gap of 10 mm follows.
     assert np.unique(board.xy_mm()[:, 0]).tolist() == [0, 40, 50, 90, 100, 140]
     np.testing.assert_allclose(board.places_mm([DotLabel(3, 0), DotLabel(0, 5)]), [[0, 0, 0], [140, -90, 0]])
-
-
-def test_a_chessboard_that_looks_the_same_turned_has_both_numberings():
     both = CornerBoard.of(ChessboardDesign(3, 5, 10.0)).numberings(np.array([0, 1]))
     assert both.tolist() == [[[0, 0], [0, 1]], [[2, 4], [2, 3]]]
     assert len(CornerBoard.of(ChessboardDesign(4, 5, 10.0)).numberings(np.array([0]))) == 1
-
-
-@pytest.mark.parametrize("option", ["--solve paper", "--compare paper"])
-def test_the_published_method_needs_dots(option):
-    with fails_with(f"E-OPTION-CONFLICT … {option} … squares or tags"):
-        require_dots(CornerBoard.of(BOARDS["chessboard"]), option)
 
 
 @pytest.mark.slow

@@ -64,33 +64,14 @@ def stated(saved, tmp_path):
     return statement_of(saved.board_design.stated, path, {"date": "2026-03-01"})
 
 
-def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
-    """The run is read from files, so to their digits and the adjustment's last step."""
+def test_with_nothing_stated_it_is_the_runs_own_covariance_and_contributions_add_up_as_squares(saved, plain):
+    """The run is read from files, so to their digits and the adjustment's last step. Its board has the default of
+    0.005 mm, which nobody has measured."""
     assert {row.measurand.name for row in plain.of_kind("position")} == {"2", "4", "5"}
     for kind, part in (("position", slice(3, 6)), ("rotation", slice(3))):
         for row in plain.of_kind(kind):
             own = saved.faces.target_from_face_covariance[row.measurand.name][part, part]
             np.testing.assert_allclose(row.covariance, own, rtol=0, atol=1e-3 * np.abs(own).max())
-
-
-def test_photographs_that_differ_are_what_is_counted(saved, plain, monkeypatch):
-    state, start = adjusted_run(saved)
-    monkeypatch.setattr(combine, "adjusted_run", lambda _: (replace(state, differ=3.0), start))
-    told, images = budget_of_run(saved), sum(len(model.images) for model in plain.joint.models)
-    for before, after in zip(plain.rows, told.rows, strict=True):
-        assert before.standard < after.standard <= 3 * before.standard
-        assert images <= after.freedom < before.freedom
-
-
-def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
-    summary = saved.report["summary"] | {"sigma_enlarged": 1.5}
-    told = budget_of_run(replace(saved, report=saved.report | {"summary": summary}))
-    for before, after in zip(plain.rows, told.rows, strict=True):
-        assert after.standard == pytest.approx(1.5 * before.standard, rel=0.02)
-
-
-def test_contributions_add_up_as_squares(saved, plain):
-    """The board of the run has the default of 0.005 mm, which nobody has measured."""
     (dots,) = (row for row in plain.sources if row.key == "board_dots")
     assert (dots.origin, "the default" in dots.words) == ("assumed", True)
     assert len(plain.rows) == 3 + 3 + 6 + 5
@@ -105,8 +86,25 @@ def test_contributions_add_up_as_squares(saved, plain):
         assert 0.952 < row.coverage < 0.995
 
 
-def test_what_is_stated_adds_its_part(saved, plain, stated):
-    """A length of L mm: pitch 10 ppm; α u(T) = 8 · 0.5 and 23 · 1 ppm; u(α) ΔT = 0.5 · 4 and 1 · 2 ppm."""
+def test_photographs_that_differ_are_what_is_counted_and_sigma_are_as_large_as_checks_made_them(
+    saved, plain, monkeypatch
+):
+    summary = saved.report["summary"] | {"sigma_enlarged": 1.5}
+    enlarged = budget_of_run(replace(saved, report=saved.report | {"summary": summary}))
+    state, start = adjusted_run(saved)
+    monkeypatch.setattr(combine, "adjusted_run", lambda _: (replace(state, differ=3.0), start))
+    differing, images = budget_of_run(saved), sum(len(model.images) for model in plain.joint.models)
+    for before, larger, after in zip(plain.rows, enlarged.rows, differing.rows, strict=True):
+        assert larger.standard == pytest.approx(1.5 * before.standard, rel=0.02)
+        assert before.standard < after.standard <= 3 * before.standard
+        assert images <= after.freedom < before.freedom
+
+
+def test_what_is_stated_adds_its_part_and_one_thermometer_errs_in_the_difference_of_the_expansions(
+    saved, plain, stated
+):
+    """A length of L mm: pitch 10 ppm; α u(T) = 8 · 0.5 and 23 · 1 ppm; u(α) ΔT = 0.5 · 4 and 1 · 2 ppm. By one
+    thermometer |8 · 0.5 − 23 · 1| ppm, and nothing for bodies of one alloy; all other rows are as without it."""
     found = budget_of_run(saved, stated)
     ppm = {"board_pitch": 10.0, "board_temperature": 4.0, "board_expansion": 2.0}
     ppm |= {"target_temperature": 23.0, "target_expansion": 2.0}
@@ -121,12 +119,8 @@ def test_what_is_stated_adds_its_part(saved, plain, stated):
     assert {each.origin for each in plain.sources if each.key in ppm} == {"not stated"}
     assert origins["circle_centres"] == "estimated"
     assert found.conditions.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
-
-
-def test_one_thermometer_of_both_errs_in_the_difference_of_the_expansions(saved, stated):
-    """A length of L mm: |8 · 0.5 − 23 · 1| ppm; nothing for bodies of one alloy. All other rows are as without it."""
-    apart, common = (budget_of_run(saved, replace(stated, one_thermometer=one)) for one in (False, True))
-    for before, after in zip(apart.of_kind("distance"), common.of_kind("distance"), strict=True):
+    common = budget_of_run(saved, replace(stated, one_thermometer=True))
+    for before, after in zip(found.of_kind("distance"), common.of_kind("distance"), strict=True):
         length = 1e-6 * after.measurand.length_mm
         assert after.contributions["temperature"] / length == pytest.approx(19.0, rel=5e-3)
         gone = {"board_temperature", "target_temperature"}
@@ -163,7 +157,7 @@ def test_rims_that_were_estimated_are_a_row(saved, plain):
         assert row.contributions["rims"] == pytest.approx(0.005 * np.linalg.norm(apart), rel=0.02)
 
 
-def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
+def test_a_statement_goes_before_the_boards_own_which_its_file_keeps(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text("one_thermometer = true\n[board]\ntemperature_c = 24\n[fields]\ndate = 2026-11-27\n")
     own = StatedSize(expansion_ppm_per_k=8.0, temperature_c=30.0)
@@ -177,6 +171,9 @@ def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     conditions = conditions_of(found, saved.board_design)
     assert (conditions.correction, conditions.temperature_c) == (pytest.approx(32e-6), None)
     assert "a correction of +32.0 ppm" in conditions.words
+    size = StatedSize(12.0, 8.5, 0.5, 23.25, 0.5, 22.0)
+    path.write_text(board_toml(replace(saved.board_design, stated=size)))
+    assert load_board(path).stated == size
 
 
 WARM_BOARD = StatedSize(expansion_ppm_per_k=8.5, temperature_c=22.7)
@@ -210,18 +207,15 @@ def scale_of(*distances):
     return ScaleReference(0, 0, 1.0, 0.25, "bright", 1.0, distances=distances)
 
 
-def test_a_size_of_the_target_itself_does_not_expand():
+def test_a_size_of_the_target_itself_does_not_expand_and_without_one_nothing_in_mm_is_certified(saved, plain, tmp_path):
     """No board was used: what is stated of one must not change a length."""
     known = KnownDistance(CircleLabel("1", "1"), CircleLabel("1", "2"), 100.0, 0.01)
     found = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(known))
     assert (found.size_known, found.correction, found.temperature_c) == (True, 0.0, 20.0)
-    drawn = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(replace(known, drawn=True)))
+    without = scale_of(replace(known, drawn=True))
+    drawn = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), without)
     assert (drawn.size_known, drawn.correction, drawn.temperature_c) == (False, 0.0, None)
-
-
-def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path):
-    known = KnownDistance(CircleLabel("1", "1"), CircleLabel("1", "2"), 100.0, 0.01, drawn=True)
-    shape = replace(plain, conditions=conditions_of(plain.statement, scale_of(known)))
+    shape = replace(plain, conditions=conditions_of(plain.statement, without))
     file = BudgetFile.of(shape, saved, verify(saved.folder))
     assert not file.size_known
     assert (file.reference_temperature_c, file.correction_ppm, file.distances) == (None, None, [])
@@ -233,13 +227,6 @@ def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path)
         assert not any(word in shown for word in ("Certificate", "hold at", "position of face", "longest distance"))
     (tmp_path / "lengths.csv").write_text("from,to,length_mm\n1:1,1:2,100\n")
     refuses("E-BUDGET-NO-SIZE", against_stated, shape, tmp_path / "lengths.csv")
-
-
-def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
-    size = StatedSize(12.0, 8.5, 0.5, 23.25, 0.5, 22.0)
-    path = tmp_path / "board.toml"
-    path.write_text(board_toml(replace(saved.board_design, stated=size)))
-    assert load_board(path).stated == size
 
 
 def test_the_longest_distances_are_of_different_pairs_of_faces():
@@ -290,16 +277,12 @@ def test_command(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
 
 
-def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
+def test_a_changed_run_is_named_and_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     copy = own_copy(small_run, tmp_path / "run")
     (copy / "report.html").write_text("x")
     code, text, _ = stcal_sfm("budget", copy)
     assert (code, len(text.splitlines()) <= 15) == (0, True)
     assert "changed since the run: report.html" in text
-
-
-def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
-    copy = own_copy(small_run, tmp_path / "run")
     report = json.loads((copy / "report.json").read_text())
     title = report["checks"][1]["title"]
     report["checks"][1]["verdict"] = "failed"
@@ -444,11 +427,9 @@ def test_lengths_that_are_none(plain, tmp_path, row, words):
     refuses(words, against_stated, plain, tmp_path / "lengths.csv")
 
 
-@pytest.mark.parametrize(
-    ("value", "shown"), [(14.26, "14"), (9.96, "10"), (0.01234, "0.012"), (126.0, "130"), (None, "–")]
-)
-def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_of_them(value, shown):
-    assert significant(value) == shown
+def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_of_them():
+    shown = {14.26: "14", 9.96: "10", 0.01234: "0.012", 126.0: "130", None: "–"}
+    assert {value: significant(value) for value in shown} == shown
     assert [as_exact(166.18664, 0.031), as_exact(236.457, 15.0), as_exact(1.23456, 0.0)] == ["166.187", "236", "1.2346"]
 
 
@@ -460,7 +441,8 @@ def certified(saved, plain):
     return file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
 
 
-def test_a_certificate_has_all_inputs_stated_and_a_traceability(saved, plain, certified):
+def test_a_certificate_has_all_inputs_stated_and_a_traceability_and_never_says_how_to_use_it(saved, plain, certified):
+    """ISO/IEC 17025 keeps results of the item from what helps its user; each photograph has its hash."""
     full, file = certified, BudgetFile.of(plain, saved, verify(saved.folder))
     for one, lacks in (
         *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
@@ -478,10 +460,6 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(saved, plain, ce
     assert "origin at circle" in page
     assert saved.folder.parent.name not in page
     assert [row.value for row in file.stated if row.key == "pitch_mm"] == [saved.board_design.pitch_mm]
-
-
-def test_what_a_certificate_never_says(certified):
-    """ISO/IEC 17025 keeps results of the item from what helps its user; each photograph has its hash."""
     file, page = certified, budget_report(certified).page()
     for word in ("May the run", "May I use", "faces.json", "--", "as `draw` numbers them", '<img src=""'):
         assert word not in re.sub("<style>.*?</style>|<script>.*?</script>", "", page, flags=re.DOTALL), word

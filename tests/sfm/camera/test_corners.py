@@ -51,27 +51,21 @@ def test_photographs_of_a_drawn_board_give_the_camera_with_its_sigma(tmp_path, s
         assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"] + 0.5  # half a pixel of drawing
 
 
-@pytest.mark.parametrize(
-    "board",
-    [
+def test_points_keep_their_places_and_corners_are_dots_without_extent():
+    """The label of each point of a view stands where the board has the point."""
+    for board in (
         AprilGridDesign(3, 4, 20.0, 0.3),
         AsymmetricCirclesDesign(5, 3, 8.0, 2.0, "dark"),
         AsymmetricCirclesDesign(4, 3, 8.0, None, "dark"),
         HexagonalCirclesDesign(5, 4, 8.0, 2.0, "dark"),
         ChessboardDesign(4, 6, 25.0),
         CharucoDesign(5, 7, 30.0, 20.0, "DICT_4X4_50"),
-    ],
-)
-def test_points_keep_their_places(board):
-    """The label of each point of a view stands where the board has the point."""
-    grid = corner_grid(board)
-    labels = [DotLabel(*cell) for cell in grid.cells().tolist()]
-    places = grid.places_mm(labels)[:, :2]
-    np.testing.assert_allclose(places - places[0], board.xy_mm() - board.xy_mm()[0], atol=1e-5)
-    assert len(set(labels)) == len(board.xy_mm())
-
-
-def test_corners_are_dots_without_extent():
+    ):
+        grid = corner_grid(board)
+        labels = [DotLabel(*cell) for cell in grid.cells().tolist()]
+        places = grid.places_mm(labels)[:, :2]
+        np.testing.assert_allclose(places - places[0], board.xy_mm() - board.xy_mm()[0], atol=1e-5)
+        assert len(set(labels)) == len(board.xy_mm())
     grid = corner_grid(ChessboardDesign(4, 6, 25.0, 0.02))
     assert (grid.rows, grid.columns, grid.pitch_mm, grid.sigma_mm) == (4, 6, 25.0, 0.02)
     with fails_with("E-BOARD-TYPE … tags"):

@@ -93,16 +93,13 @@ def test_truth_within_predicted_sigma(field_px, count, low, high):
         assert 0.05 < result.sigma()[0] < 0.2
 
 
-def test_sigma_follows_what_the_centres_do():
+def test_sigma_follows_what_the_centres_do_and_a_bad_dot_is_weighed_down():
     # Centres five times as bad as they say: found out, and σ grow as much.
     views = views_of(np.random.default_rng(5), noise_px=0.1)
     honest = calibrated(views)
     boastful = calibrated([replace(v, covariance_px2=v.covariance_px2 / 25) for v in views])
     assert boastful.factors.centres == pytest.approx(5 * honest.factors.centres, rel=0.02)
     assert boastful.sigma() == pytest.approx(honest.sigma(), rel=0.05)
-
-
-def test_a_bad_dot_is_weighed_down():
     views = views_of(np.random.default_rng(6))
     shifted = views[3].centre_px + 1.0 * (np.arange(len(views[3])) == 7)[:, None]
     spoilt = calibrated([*views[:3], replace(views[3], centre_px=shifted), *views[4:]])
@@ -114,14 +111,12 @@ def test_a_bad_dot_is_weighed_down():
     assert named == ("3.jpg", views[3].labels[7])
 
 
-def test_a_model_of_fewer_parameters():
+def test_models_of_fewer_and_of_more_parameters():
+    """The rational model knows projections, though not its coefficients."""
     camera = replace(TRUE, focal=[2790.0, 2790.0], distortion=[-0.1, *[0] * 7])
     result = calibrated(views_of(np.random.default_rng(7), camera=camera), "SIMPLE_RADIAL")
     e = error(result, camera)
     assert 0.01 < e @ np.linalg.solve(result.covariance, e) / chi2.ppf(0.999, len(e)) < 1
-
-
-def test_rational_model_knows_projections_though_not_its_coefficients():
     result = calibrated(views_of(np.random.default_rng(8)), "FULL_OPENCV")
     sigma = projection_sigma(result)
     moved = np.abs(result.camera.project(RAYS) - TRUE.project(RAYS)).max()
@@ -288,7 +283,7 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     assert any("no dots near the corner" in warning for warning in summary["warnings"])
 
 
-def test_an_unknown_model_and_images_without_a_board_are_refused(stcal_sfm, small_dataset, tmp_path):
+def test_what_cannot_be_calibrated_is_refused_and_why(stcal_sfm, small_dataset, tmp_path, small_set):
     words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
     ended = stcal_sfm(*words)
     assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
@@ -299,9 +294,6 @@ def test_an_unknown_model_and_images_without_a_board_are_refused(stcal_sfm, smal
     assert code == 3
     assert "error: camera: no board recognised in 3 images; 0.png: no board recognised; check the board" in message
     assert not (tmp_path / "c.txt").exists()
-
-
-def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     own = small_set("12", detected=False)
     own.image(3).unlink()
     cv2.imwrite(str(own.image(2)), np.zeros((400, 600), np.uint8))

@@ -128,18 +128,15 @@ def shifted(image):
     return replace(image, centre_px=image.centre_px + on_face(image)[:, None] * [0.4, 0])
 
 
-def test_what_one_image_has_is_no_cause_of_the_whole_set(few, lab):
-    """Another place of the target in one, and another focus in one."""
+def test_what_one_image_has_is_no_cause_of_the_whole_set_and_of_two_halves_of_a_group_none_is_named(few, lab):
+    """Another place of the target in one, and another focus in one. Where the target stood elsewhere in two of four
+    images, that it moved is said, and that either half may be it."""
     images = [shifted(image) if k == 3 else image for k, image in enumerate(lab.observe(few))]
     check = first(few, lab, images)
     assert check.key != CAUSE
     assert check.names[0] == images[3].name
     refocused, _ = zoomed(lambda _, k: 0.01 * (k == 5))(few, lab.observe(few))
     assert first(few, lab, refocused).key != CAUSE
-
-
-def test_of_two_halves_of_a_group_none_is_named(few, lab):
-    """Two of four images in which the target stood elsewhere: that it moved is said, and that either half may be it."""
     images = [shifted(image) if k in (0, 1) else image for k, image in enumerate(lab.observe(few))]
     checks = lab.check(few, images)
     best = ranked(list(checks.values()), frozenset(image.name for image in images))[0]

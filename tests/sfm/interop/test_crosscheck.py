@@ -172,14 +172,11 @@ def refused(refused_page_and_all, no_page):
     return refused_page_and_all
 
 
-@pytest.mark.usefixtures("no_page")
-def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    outcome = stcal_sfm("crosscheck", own_run)
+def test_programs_that_are_not_there_or_not_colmap(refused, own_run, stcal_sfm, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path))
+        outcome = stcal_sfm("crosscheck", own_run)
     assert_error(outcome, INPUT, "E-COLMAP-PROGRAM", "on the PATH", INSTALL, "--colmap")
-
-
-def test_programs_that_are_not_there_or_not_colmap(refused, tmp_path):
     (tmp_path / "text").write_text("no program")
     for place in (tmp_path / "none", tmp_path / "text"):
         refused(place, INPUT, f"native COLMAP: no program at {place} that can be executed", INSTALL)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Rigid
 from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.static_transforms import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 
 AGAIN_MM = 1e-9
@@ -185,16 +185,7 @@ def content_of_gltf(path) -> tuple[dict, bytes]:
         ("box.csv", "stl", "target", "E-OPTION-FORM … --form … stl … urdf"),
         ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
         ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
-        ("mine.csv", "", "target", "E-OUTPUT-EXISTS"),
     ],
 )
 def test_refused(small_run, tmp_path, name, form, root, said):
-    (tmp_path / "mine.csv").write_text("mine", encoding="utf-8")
-    with fails_with(said):
-        export_run(small_run, tmp_path / name, form, root)
-    assert (tmp_path / "mine.csv").read_text(encoding="utf-8") == "mine"
-
-
-def test_the_form_may_be_told(small_run, tmp_path, faces):
-    path = export_run(small_run, tmp_path / "box.txt", "tf2", "box").path
-    require_frames(read_messages(path.read_text(encoding="utf-8")), faces)
+    refuses(said, export_run, small_run, tmp_path / name, form, root)

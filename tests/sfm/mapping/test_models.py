@@ -184,8 +184,9 @@ def test_all_groups_in_one_world(saved, tmp_path):
         assert np.allclose(pose.matrix(), known, rtol=0, atol=1e-8), face  # as above: moved, and scaled to mm
 
 
-def test_circles_that_are_one_point_in_all_groups(saved):
-    """The run's final model: the circles of face 1 are seen by both groups, the board of each is its own."""
+def test_points_of_all_groups_and_boards_of_two_groups_merged(saved, tmp_path):
+    """In the run's final model the circles of face 1 are seen by both groups, the board of each is its own. The same
+    dot merged, but the board was moved between the groups: the point is neither's."""
     path = saved.folder / "colmap/target_model"
     groups = {group.group: group for group in read(path, saved).groups}
     place = {g: dict(zip(m.labels, m.xyz_model.tolist(), strict=True)) for g, m in groups.items()}
@@ -197,10 +198,6 @@ def test_circles_that_are_one_point_in_all_groups(saved):
         same = place["12"][label] == place["14"][label]
         assert same != label.startswith("board:"), label
     assert [m.group for m in calibrate_models(path, saved).models] == ["12", "14"]
-
-
-def test_boards_of_two_groups_merged(saved, tmp_path):
-    """The same dot, but the board was moved between the groups: the point is neither's."""
     target = pycolmap.Reconstruction(str(saved.folder / "colmap/target_model"))
     labels = {image.name: image.labels for image in saved.observations}
     dot = {}
@@ -396,13 +393,10 @@ def test_a_file_that_is_another_one_or_missing(saved, plain, tmp_path, name):
             calibrate_models(folder, saved)
 
 
-def test_an_empty_model(saved, stcal_sfm, tmp_path):
+def test_a_model_without_a_camera_and_one_without_the_group_of_the_reference_face(saved, stcal_sfm, tmp_path):
+    """Group 14 alone has no face 2; group 12 is missing and named."""
     pycolmap.Reconstruction().write_binary(str(tmp_path))
     assert_error(stcal_sfm("faces", tmp_path, "--run", saved.folder), INPUT, "E-MODEL-CAMERAS", "0")
-
-
-def test_a_lost_group_is_said_where_a_face_hangs_on_it(saved):
-    """Group 14 alone has no face 2; group 12 is missing and named."""
     options = replace(saved.options, reference_face="2")
     only = read(saved.folder / "colmap/models" / "14", saved)
     with fails_with("E-FACE-REFERENCE … 2"):

@@ -161,7 +161,8 @@ def test_derivatives_of_the_ellipse_centres(scene, known):
         assert np.abs(slope - exact.by_circle[..., k]).max() < 1e-9
 
 
-def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
+def test_a_pose_is_exact_names_its_outliers_and_has_the_sigma_factor_of_the_run_or_a_given_one(scene, known):
+    """Whatever the order of the circles."""
     truth, _, image = one_view(scene, np.random.default_rng(6), ("4",), 0.0, (30, 40), (800, 900))
     pose = pose_from_circles(image, known.truth, scene.camera)
     error = pose_error(pose.camera_from_target, truth)
@@ -171,6 +172,25 @@ def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
     turned = pose_from_circles(other_order, known.truth, scene.camera)
     assert np.abs(pose_error(turned.camera_from_target, pose.camera_from_target)).max() < 1e-9
     assert turned.labels == pose.labels
+    truth, _, image = one_view(scene, np.random.default_rng(8), ("2",), NOISE_PX, (20, 40), (900, 1000))
+    centre = image.centre_px.copy()
+    centre[3] += [0.8, -0.5]
+    pose = pose_from_circles(replace(image, name="a.jpg", centre_px=centre), known.truth, scene.camera)
+    assert [(o.image, o.label) for o in pose.outliers] == [("a.jpg", image.labels[3])]
+    assert image.labels[3] not in pose.labels
+    assert 0.7 < pose.outliers[0].residual_px < 1.5
+    error = pose_error(pose.camera_from_target, truth)
+    assert error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-3, 6)
+    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
+    own = known.truth
+    twice = TargetCircles(own.labels, own.xyz, own.radius, own.covariance, 2.0)
+    given = {"options": PoseOptions(sigma_factor=1.0)}
+    parts = [
+        pose_from_circles(image, target, scene.camera, **more).parts["image"]
+        for target, more in ((own, {}), (twice, {}), (twice, given))
+    ]
+    assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
+    assert np.allclose(parts[2], parts[0], rtol=1e-9, atol=0)
 
 
 def test_stated_intrinsics_go_into_the_covariance(scene, known):
@@ -190,31 +210,6 @@ def test_stated_intrinsics_go_into_the_covariance(scene, known):
             results.append(error @ np.linalg.solve(pose.covariance, error) / 6)
     assert abs(np.mean(square) - 1) < 0.15 * np.sqrt(200 / count)  # its standard error is 0.04 for 200
     assert np.mean(held) > 3
-
-
-def test_outliers_are_named_and_left_out(scene, known):
-    truth, _, image = one_view(scene, np.random.default_rng(8), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    centre = image.centre_px.copy()
-    centre[3] += [0.8, -0.5]
-    pose = pose_from_circles(replace(image, name="a.jpg", centre_px=centre), known.truth, scene.camera)
-    assert [(o.image, o.label) for o in pose.outliers] == [("a.jpg", image.labels[3])]
-    assert image.labels[3] not in pose.labels
-    assert 0.7 < pose.outliers[0].residual_px < 1.5
-    error = pose_error(pose.camera_from_target, truth)
-    assert error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-3, 6)
-
-
-def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
-    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    own = known.truth
-    twice = TargetCircles(own.labels, own.xyz, own.radius, own.covariance, 2.0)
-    given = {"options": PoseOptions(sigma_factor=1.0)}
-    parts = [
-        pose_from_circles(image, target, scene.camera, **more).parts["image"]
-        for target, more in ((own, {}), (twice, {}), (twice, given))
-    ]
-    assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
-    assert np.allclose(parts[2], parts[0], rtol=1e-9, atol=0)
 
 
 def test_too_few_circles_and_wrong_labels(scene, known):

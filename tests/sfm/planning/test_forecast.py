@@ -110,24 +110,21 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
     assert low < square < high, square / errors.size
 
 
-def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact):
+def test_images_are_worth_their_root_unless_the_board_dominates_and_scale_is_as_good_as_the_plate(exact):
+    """A plate of n dots with σ: its scale has σ/√Σr², whatever the images (least squares of a similarity)."""
     models = models_of(exact)
     doubled = [m.plus(replace(m, images=tuple(f"{name} again" for name in m.images))) for m in models]
     setups = [setup_of(exact, board_sigma_mm) for board_sigma_mm in (1e-4, 1.0)]
     once, twice = ([forecast(m, own) for own in setups] for m in (models, doubled))
     assert twice[0].worst()[1] / once[0].worst()[1] == pytest.approx(0.708, abs=1e-3)
     assert 0.85 <= twice[1].scale_sigma / once[1].scale_sigma <= 1
-
-
-def test_scale_is_as_good_as_the_plate(exact):
-    """A plate of n dots with σ: its scale has σ/√Σr², whatever the images (least squares of a similarity)."""
     setup = setup_of(exact, 0.02, 0.99)
     away = exact.board.xy_mm() - exact.board.xy_mm().mean(0)
     expected = 0.02 / np.sqrt((away**2).sum())
     assert forecast(models_of(exact, CentreNoise(1e-3)), setup).scale_sigma == pytest.approx(expected, rel=0.02)
 
 
-def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
+def test_centre_noise_of_a_disc_is_its_cramer_rao_bound_and_found_again(exact):
     """Fisher's information of a blurred disc, summed over pixels."""
     radius, step = 15.0, 1e-3
     y, x = np.mgrid[-30:31, -30:31]
@@ -138,6 +135,9 @@ def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
     slope = (disc(step) - disc(-step)) / (2 * step)
     bound = IMAGE_NOISE / np.sqrt((slope**2).sum())
     assert PRACTICE * bound == pytest.approx(CentreNoise.expected().edge / np.sqrt(np.pi * radius), rel=0.01)
+    radius = exact.target.radius_of() | exact.board.radius_of()
+    found = CentreNoise.measured(models_of(exact), exact.camera, radius)
+    assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 76.0])
@@ -159,12 +159,6 @@ def test_what_a_rim_tells_is_the_integral_around_it(tilt_deg):
     )  # fmt: skip
     found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
     np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
-
-
-def test_centre_noise_is_found_again(exact):
-    radius = exact.target.radius_of() | exact.board.radius_of()
-    found = CentreNoise.measured(models_of(exact), exact.camera, radius)
-    assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
 
 
 def known_from(scene: Scene) -> KnownRun:
@@ -248,15 +242,12 @@ def offered(known):
     return [(model, handed_over(candidates(*handed_over((known, model))))) for model in known.models]
 
 
-def test_an_advised_view_beats_a_random_one(known, advice, coarse):
+def test_an_advised_view_beats_a_random_one_unless_a_bad_board_dominates(known, advice, coarse):
     views = [view for _, own in offered(known) for view in own]
     random = [after(known, [view], advice.now).worst()[1] for view in views[::2]]
     now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
     assert best <= min(random) * (1 + 1e-6)
     assert (now - best) > 1.5 * (now - np.mean(random)) > 0
-
-
-def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     found = advise(replace(known, setup=setup_of(known.scene, 0.2)), 1)
     assert found.board_dominates
     assert not advice.board_dominates
@@ -288,16 +279,21 @@ def test_a_candidate_shows_nothing_that_is_hidden(known, coarse):
             assert max(view.tilts_deg.values()) < 75
 
 
-def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
-    known = known_of(load_run(small_run))
+def test_advise_of_a_run_starts_from_its_own_sigma_and_says_where_it_is_not_to_be_trusted(small_run):
+    known = known_of(saved := load_run(small_run))
     now = forecast(known.models, known.setup)
     stated = json.loads((small_run / "faces.json").read_text())["target_from_face_covariance"]
     for face, covariance in now.face_covariance.items():
         # Huber's weights of the few long residuals make the difference.
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
+    first, *checks = saved.report["checks"]
+    failed = replace(saved, report=saved.report | {"checks": [first | {"verdict": "failed"}, *checks]})
+    control = replace(saved, options=replace(saved.options, eccentricity=False))
+    assert "uncorrected control" in doubts(control)
+    assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
 
 
-def test_a_plan_takes_a_camera_as_its_file():
+def test_a_plan_takes_a_camera_as_its_file_that_states_its_size():
     camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
     target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
     for given in (camera, model_of(camera)):
@@ -305,6 +301,9 @@ def test_a_plan_takes_a_camera_as_its_file():
         assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
         assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
+    with fails_with("E-CAMERA-SIZE"):
+        PlanOptions(camera=camera)
 
 
 def test_advice_holds_the_sigma_of_estimated_rims(small_run):
@@ -332,15 +331,6 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
         assert shares[face]["rims"] == pytest.approx(added / np.trace(covariance[3:, 3:]), rel=0.01)
         assert sum(shares[face].values()) == pytest.approx(1, abs=1e-3)
         assert np.sqrt(further[face] ** 2 - further_seen[face] ** 2) == pytest.approx(expected, rel=0.02)
-
-
-def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(small_run):
-    saved = load_run(small_run)
-    first, *checks = saved.report["checks"]
-    failed = replace(saved, report=saved.report | {"checks": [first | {"verdict": "failed"}, *checks]})
-    control = replace(saved, options=replace(saved.options, eccentricity=False))
-    assert "uncorrected control" in doubts(control)
-    assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
 
 
 def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):
@@ -403,12 +393,6 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
     path.write_text(faces or "")
     with fails_with(message):
         nominal_poses(target, path if faces else None)
-
-
-def test_plan_needs_the_size_of_the_camera():
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
-    with fails_with("E-CAMERA-SIZE"):
-        PlanOptions(camera=camera)
 
 
 @pytest.mark.parametrize(("common", "refined"), [(0.0, True), (0.99, False)])

@@ -18,7 +18,7 @@ from stcal.io.images import decode
 from stcal.sfm.data.group_model import GROUP_LEFT_OUT
 from stcal.sfm.detect import detect_files as files
 from stcal.synthetic.scene import image_circles
-from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of, refuses
 
 pytestmark = pytest.mark.slow
 
@@ -67,19 +67,22 @@ def blacken(small, scene, group: str, board: bool, count: int) -> None:
         small.image(i, group).write_bytes(encoded(".jpg", picture))
 
 
-def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
-    small = small_set()
+def test_inputs_that_are_not_there(small_set, stcal_sfm):
+    """Designs that are impossible are in tests/boards/test_target_files.py."""
+    small = small_set("12")
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-VIDEO-UNREADABLE", str(small.camera), "a folder of images")
     assert not (small.out / ".stcal/cache" / "frames").exists()
-
-
-def test_no_image_is_left(small_set, stcal_sfm):
-    small = small_set("12")
-    for path in (small.images / "12").iterdir():
-        path.write_bytes(b"")
+    path = small.folder / "none.toml"
+    for kind in ("--target", "--board"):
+        outcome = stcal_sfm(*small.arguments(kind, path))
+        assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
+    for photograph in (small.images / "12").iterdir():
+        photograph.write_bytes(b"")
     parts = ("4", "12/IMG_1000.jpg", "empty file (0 bytes); copy it again")
     assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
+    shutil.rmtree(small.images / "12")
+    refuses("E-IMAGES-NONE", stcal_sfm, *small.arguments("--debug"))  # which lets the error through
 
 
 @pytest.mark.usefixtures("no_page")
@@ -151,14 +154,6 @@ def test_a_group_without_the_board_and_a_photograph_in_two_groups(small_set, sma
     assert "4" not in faces
 
 
-@pytest.mark.parametrize("kind", ["target", "board"])
-def test_a_design_that_is_missing(small_set, stcal_sfm, kind):
-    """Impossible ones are in tests/boards/test_target_files.py."""
-    path = (small := small_set("12")).folder / "none.toml"
-    outcome = stcal_sfm(*small.arguments(f"--{kind}", path))
-    assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
-
-
 def opencv_yaml(focal: float, x: float, y: float, distortion: list[float]) -> str:
     """A camera file that does not state the image size."""
     matrix = [float(v) for v in (focal, 0, x, 0, focal, y, 0, 0, 1)]
@@ -170,11 +165,10 @@ WRONG_CAMERAS = [
     (None, INPUT, ("No such file", "camera file ")),
     ("prose", INPUT, ("E-CAMERA-UNREADABLE", "camera file ")),
     (opencv_yaml(5580, 2592, 1728, []), INPUT, ("E-CAMERA-CENTRE", "camera.yml", *OUTSIDE)),  # for larger images
-    pytest.param(
+    (
         opencv_yaml(3000, 648, 432, []),  # another one than took the images
         COMPUTATION,
         ("group 12: ", "check that the camera file belongs to the images"),
-        marks=pytest.mark.slow,
     ),
 ]
 
@@ -199,12 +193,6 @@ def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
     assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.out), "--out")
     assert [p.name for p in small.out.iterdir()] == ["faces.json"]
     assert (small.out / "faces.json").read_text(encoding="utf-8") == "mine"
-
-
-def test_debug_lets_the_error_through(small_set, stcal_sfm):
-    small = small_set()
-    with fails_with("E-IMAGES-NONE"):
-        stcal_sfm(*small.arguments("--debug"))
 
 
 @pytest.mark.usefixtures("no_page")

@@ -86,8 +86,9 @@ def views(roll_deg: float) -> list[PlaneView]:
     return [PlaneView(**common, area=1.0, camera_from_plane=each) for each in (pose, pose @ half_turn)]
 
 
-def test_numberings_follow_the_camera_up_to_a_quarter_turn():
-    """From each image to its nearest, over more than a quarter turn in all."""
+def test_numberings_follow_the_camera_up_to_a_quarter_turn_and_whether_an_image_shows_the_board_whole():
+    """From each image to its nearest, over more than a quarter turn in all. Of a board with a covered strip, numberings
+    a pitch apart do not differ by the camera's turn."""
     rolls = [0, 35, 70, 105]
     chosen = _numbered([views(r)[::-1] if i % 2 else views(r) for i, r in enumerate(rolls)])
     for view, roll in zip(chosen, rolls, strict=True):
@@ -95,10 +96,6 @@ def test_numberings_follow_the_camera_up_to_a_quarter_turn():
     first, second = _numbered([views(0), views(88)])
     assert isinstance(first, PlaneView)
     assert "2 numberings fit, the camera is turned by 88° or 92° from the nearest image" in second
-
-
-def test_a_covered_strip_leaves_a_board_without_numbers_unless_an_image_shows_it_whole():
-    """Numberings a pitch apart do not differ by the camera's turn."""
     shifted = [replace(v, camera_from_plane=v.camera_from_plane @ Rigid(np.eye(3), [30.0, 0, 0])) for v in views(20)]
     chosen = _numbered([[*views(20), *shifted], views(0)])
     assert [isinstance(each, PlaneView) for each in chosen] == [False, True]

@@ -48,10 +48,15 @@ class Here(Executor):
         return future
 
 
-def test_jobs_go_to_an_executor_a_few_at_a_time():
+def test_jobs_go_to_an_executor_a_few_at_a_time_with_paths_from_the_root(tmp_path, monkeypatch):
     with ThreadPoolExecutor(3) as pool:
         found = dict(hand_over(pool, pow, [(i, 2) for i in range(50)], 4))
     assert found == {i: i * i for i in range(50)}
+    monkeypatch.chdir(tmp_path)
+    with spread(Here(), 3):
+        assert dict(run_on_images(lambda file: file.path, [(ImageFile(Path("a.jpg"), "a.jpg", "."),)])) == {
+            0: tmp_path / "a.jpg"
+        }
 
 
 def end(_):
@@ -65,14 +70,6 @@ def test_processes_that_end_and_folders_that_workers_do_not_see_are_one_line(tmp
     file = ImageFile(tmp_path / "elsewhere" / "a.jpg", "a.jpg", ".")
     with spread(Here(), 3), fails_with("E-WORKER-PATH … elsewhere … --send-images"):
         dict(run_on_images(len, [(file,)]))
-
-
-def test_paths_go_to_workers_from_the_root(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with spread(Here(), 3):
-        assert dict(run_on_images(lambda file: file.path, [(ImageFile(Path("a.jpg"), "a.jpg", "."),)])) == {
-            0: tmp_path / "a.jpg"
-        }
 
 
 @pytest.mark.slow
@@ -89,13 +86,10 @@ def test_no_scheduler_is_one_line(monkeypatch, somebody):
             pass
 
 
-@pytest.mark.parametrize("address", ["http://x:80", "", "tcp://x", "tcp://x:y", "\x1b[31m:1"])
-def test_what_is_no_address_is_one_line(address):
-    with fails_with("E-OPTION-VALUE"), cluster.dask_cluster(address):
-        pass
-
-
-def test_workers_of_other_versions_are_refused():
+def test_what_is_no_address_and_workers_of_other_versions_are_refused():
+    for address in ("http://x:80", "", "tcp://x", "tcp://x:y", "\x1b[31m:1"):
+        with fails_with("E-OPTION-VALUE"), cluster.dask_cluster(address):
+            pass
     own = cluster.versions()
     cluster._require_same({"tcp://a": own}, "tcp://b")
     with fails_with("E-CLUSTER-VERSIONS … tcp://a … numpy 1.0"):

@@ -60,16 +60,12 @@ def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_
     assert small.image(2).exists()
 
 
-def test_an_unknown_image_is_an_error(small_set, stcal_sfm):
-    small = small_set("12")
+def test_images_are_named_as_in_results_or_by_their_path(small_set, stcal_sfm, monkeypatch):
+    small = small_set("12", "14")
     outcome = stcal_sfm(*small.arguments("--exclude", "12/IMG_1000.jpg", "--exclude", "IMG_1001.jpg"))
     assert_error(outcome, INPUT, "E-OPTION-EXCLUDE", "--exclude", "IMG_1001.jpg", "12/IMG_1000.jpg")
     outcome = stcal_sfm("detect", *small.arguments("--exclude", "12/none.jpg")[1:])
     assert_error(outcome, INPUT, "E-OPTION-EXCLUDE", "--exclude", "12/none.jpg")
-
-
-def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch):
-    small = small_set("12", "14")
     monkeypatch.chdir(small.images / "14")
     kept, left = chosen_images(small.images, ["12/IMG_1001.jpg", "IMG_1002.jpg", str(small.image(3))])
     assert [each.name for each in left] == ["12/IMG_1001.jpg", "12/IMG_1003.jpg", "14/IMG_1002.jpg"]
@@ -79,7 +75,7 @@ def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch)
         chosen_images(small.images, [each.name for each in chosen_images(small.images)[0]])
 
 
-def test_of_failed_checks_those_that_name_an_image_come_first():
+def test_failed_checks_that_name_an_image_come_first_and_those_that_others_explain_last():
     def check(key, verdict, *names):
         return Check(key, key, verdict, "", (), 1, names, "")
 
@@ -92,10 +88,7 @@ def test_of_failed_checks_those_that_name_an_image_come_first():
     ]
     order = [each.key for each in ranked(checks, frozenset({"a.jpg", "b.jpg"}))]
     assert order == ["image", "camera", "dull", "centre", "passed"]
-
-
-@pytest.mark.parametrize(("later", "why"), [("radius-design", "rim"), ("groups", "board"), ("loops", "flatness")])
-def test_a_check_that_another_one_explains_comes_after_it(later, why):
-    checks = [Check(key, key, "failed", "", (), 1, (key,), "") for key in (later, why, "agreement")]
-    assert [each.key for each in ranked(checks, frozenset())] == [why, later, "agreement"]
-    assert [each.key for each in ranked(checks[::2], frozenset())] == [later, "agreement"]
+    for later, why in (("radius-design", "rim"), ("groups", "board"), ("loops", "flatness")):
+        checks = [check(key, "failed", key) for key in (later, why, "agreement")]
+        assert [each.key for each in ranked(checks, frozenset())] == [why, later, "agreement"]
+        assert [each.key for each in ranked(checks[::2], frozenset())] == [later, "agreement"]

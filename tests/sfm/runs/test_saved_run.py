@@ -64,7 +64,7 @@ def grey(path) -> None:
     path.write_bytes(cv2.imencode(".jpg", np.full((864, 1296), 90, np.uint8))[1].tobytes())
 
 
-def test_labels_and_centres_are_the_same_numbers(written):
+def test_what_is_read_back_are_the_same_numbers_designs_and_options(written):
     result, saved = written
     assert [image.name for image in saved.observations] == [image.name for image in result.observations]
     for found, known in zip(saved.observations, result.observations, strict=True):
@@ -84,9 +84,6 @@ def test_labels_and_centres_are_the_same_numbers(written):
     assert [image.name for image in saved.groups()["12"]][1] == saved.observations[1].name == UNLABELLED
     assert [len(image.labels) > 70 for image in saved.observations] == [True, False, *[True] * 6]
     assert saved.observations[1].centre_px.shape == saved.corrected_px[1].shape == (0, 2)
-
-
-def test_camera_designs_options_and_faces_are_the_same(written):
     result, saved = written
     assert saved.camera.same_as(result.camera)
     assert saved.camera.colmap_model == result.camera.colmap_model
@@ -121,9 +118,9 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     assert saved.photographs == tmp_path / "some images"
 
 
-@pytest.mark.parametrize(
-    ("groups", "given", "expected"),
-    [
+def test_which_faces_the_photographs_were_to_show():
+    target = reference_target()
+    for groups, given, expected in (
         (("12", "14"), (), ["1", "2", "4"]),
         (("1-2", "4_1"), (), ["1", "2", "4"]),
         (("1", "2"), (), []),  # numbers of groups, most likely
@@ -132,16 +129,11 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
         (("12", "1-far"), (), []),
         (("12",), ("5", "3"), ["3", "5"]),
         ((".",), ("1",), ["1"]),
-    ],
-)
-def test_which_faces_the_photographs_were_to_show(groups, given, expected):
-    assert RunOptions(expect_faces=given).faces_expected(groups, reference_target()) == expected
-    assert RunOptions(expect_faces=given, board_only=True).faces_expected(groups, reference_target()) == []
-
-
-def test_an_expected_face_that_the_design_lacks():
-    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, reference_target())
-    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, reference_target())
+    ):
+        assert RunOptions(expect_faces=given).faces_expected(groups, target) == expected
+        assert RunOptions(expect_faces=given, board_only=True).faces_expected(groups, target) == []
+    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, target)
+    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, target)
 
 
 def edited(change):
@@ -253,33 +245,25 @@ def test_a_folder_that_is_not_as_the_run_wrote_it_is_refused(own_run, case):
         refuses("E-RUN-CHANGED", read_target, own_run / name, own_run / TARGET)
 
 
-def test_not_a_run(own_run, tmp_path, stcal_sfm):
+def test_not_a_run_and_a_folder_of_detections_only(own_run, tmp_path, stcal_sfm, small_set):
     (own_run / ".stcal/run.json").unlink()
     for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
         outcome = stcal_sfm("faces", own_run / "colmap/models", "--run", path)
         assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", ".stcal/run.json", "--out")
-
-
-def test_a_folder_of_detections_only(small_set, stcal_sfm):
     small = small_set("12")
     stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
     outcome = stcal_sfm("faces", small.out, "--run", small.out)
     assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), f"{CAMERA}, {TARGET}")
 
 
-def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
-    """Rows name their image; what counts is their order in it."""
+def test_rows_in_another_order_are_the_same_and_the_runs_own_model_has_its_own_centres(small_run, tmp_path):
+    """Rows name their image; what counts is their order in it. Poses of the joint adjustment are others than those of
+    the groups, and with a wrong camera their eccentricities differ by more than a rounded number."""
     run = unsealed_copy(small_run, tmp_path / "run")
     rows(lambda body: sorted(body, key=lambda row: (-int(row[0]), int(row[1]))))(run / "labels.csv")
     found, known = load_run(run), load_run(small_run)
     assert [image.labels for image in found.observations] == [image.labels for image in known.observations]
     assert all(np.array_equal(a, b) for a, b in zip(found.corrected_px, known.corrected_px, strict=True))
-
-
-def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_path):
-    """Its poses are others than those of the groups, and with a wrong camera their eccentricities differ by more than a
-    rounded number: the run's own model is read with its own centres."""
-    run = unsealed_copy(small_run, tmp_path / "run")
 
     def shifted(body):
         return [[*row[:7], *(str(float(value) + 0.01) for value in row[7:9]), *row[9:]] for row in body]

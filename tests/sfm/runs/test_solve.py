@@ -26,15 +26,12 @@ def only(group, board: bool):
     ]
 
 
-def test_what_is_missing_is_named(group):
+def test_what_is_missing_is_named_and_two_images_with_board_and_face_will_do(group):
+    """A group of which every file was skipped is not forgotten; a folder of copies or of notes is no group."""
     with fails_with("E-GROUP-FEW-IMAGES … 1 usable image"):
         usable_groups({group[0].group: group[:1]}, [])
     refuses("E-GROUP-NO-FACE … 5", usable_groups, {"12": only(group, board=True)}, [])
     refuses("E-GROUP-NO-BOARD … 5", usable_groups, {"12": only(group, board=False)}, [])
-
-
-def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):
-    """Its folder is one of the session: the answer without it says so."""
     lost = [Skipped("99/a.jpg", "cannot be read")]
     usable, notes = usable_groups({"12": group}, lost)
     assert list(usable) == ["12"]
@@ -42,9 +39,6 @@ def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):
     assert notes[0].startswith("left out whole: group 99: 0 usable images, 2 needed, not 99/a.jpg: cannot be read")
     with fails_with("E-GROUP-FEW-IMAGES … 99 … 0 usable images"):
         usable_groups({}, lost)
-
-
-def test_two_images_with_board_and_face_will_do_and_a_folder_of_copies_or_of_notes_is_no_group(group):
     skipped = [
         Skipped("copies/a.jpg", "the same image as 12/b.jpg", "copy"),
         Skipped("99/notes.txt", "not an image file"),

@@ -244,7 +244,9 @@ def test_what_a_command_adds_belongs_to_the_run_and_files_beside_it_do_not(made)
     assert verify(made).missing == ("compare.json",)
 
 
-def test_a_command_that_fails_adds_nothing(made):
+def test_a_command_that_fails_adds_nothing_and_runs_and_additions_wait_for_each_other(made):
+    """The same process counts as another one here: each claim opens the lock anew."""
+
     def add():
         with added_results(made) as stage:
             (stage / "report.json").write_text("half")
@@ -254,10 +256,6 @@ def test_a_command_that_fails_adds_nothing(made):
         add()
     assert verify(made).notes() == []
     assert not (made / ".stcal/unfinished").exists()
-
-
-def test_a_run_and_an_addition_wait_for_each_other(made):
-    """The same process counts as another one here: each claim opens the lock anew."""
     with added_results(made), fails_with("E-OUTPUT-IN-USE"):
         run_folder(made, MARKER, {}).__enter__()
     with run_folder(made, MARKER, {}), fails_with("E-OUTPUT-IN-USE"):
