@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 
 import stcal
-from stcal import errors, handeye, locate, register, robot, sfm, synthetic
+from stcal import Camera, InputError, errors, handeye, locate, register, robot, sfm, synthetic
 from stcal.design import TargetDesign, reference_board, reference_target
-from stcal.errors import InputError
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.handeye import HandEyePoses
 from stcal.locate import SeenTags

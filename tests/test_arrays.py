@@ -8,9 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import stcal
-from stcal import handeye, robot, sfm
+from stcal import Camera, handeye, robot, sfm
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.io.images import decode, grey_of
 from stcal.robot.kinematics.robot_model import mh80

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from stcal import Camera, compare_cameras
 from stcal.cli.instruments import camera_app as app
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.read import read_camera, save_camera
 from stcal.report.camera_figures import shown
 from tests.outcome import lines_of, refuses

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.board_file import load_board
-from stcal.boards.target_file import load_target
+from stcal import load_board, load_target
 from stcal.cli.main import main, main_sfm
 from stcal.io.table import read_table
 from tests.io.reported_cameras import SAMPLES

@@ -10,8 +10,7 @@ from typer.main import get_command
 
 import stcal
 import stcal.errors
-from stcal.boards.board_file import load_flat_board
-from stcal.boards.target_file import load_target
+from stcal import load_flat_board, load_target
 from stcal.cli.help import EXAMPLES, GROUPS
 from stcal.cli.main import app
 from stcal.locate.layout import load_layout

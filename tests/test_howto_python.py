@@ -12,10 +12,8 @@ import pytest
 from PIL import Image
 
 import stcal
-from stcal import robot
+from stcal import Camera, Poses, Rigid, robot
 from stcal.boards.board_designs import TagLayout
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.robot_model import mh80
 from tests.levels import FULL, SLOW
 from tests.support.areas import homography, rendered

@@ -6,16 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal import Rigid, TargetDesign, reference_target
 from stcal.boards.target_file import target_toml
-from stcal.design import TargetDesign, reference_target
-from stcal.geometry.rigid import Rigid
-from stcal.sfm import pipeline
+from stcal.sfm import load_run, pipeline
 from stcal.sfm.checks.suite import cause_of_drawing
 from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
 from stcal.sfm.mapping.body import BodyCorners, place_with_camera, wrong_sizes
 from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import tag_cube
 from tests.levels import sampled

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stcal import Camera, Rigid, StcalError, camera_prior
 from stcal.boards.finders import shift_by_curves
 from stcal.boards.target_file import load_target, target_toml
 from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.draw import net_text
-from stcal.errors import StcalError
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import camera_prior
 from stcal.labels import CircleLabel
-from stcal.sfm import pipeline
+from stcal.sfm import RunOptions, Tracker, compare, pipeline
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import find_scale, refine, with_edge_sigma
@@ -29,11 +26,8 @@ from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.body import model_of_body, place_and_find_camera, place_with_camera
-from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.planning.session import PlanOptions, plan, plan_text, planned_photographs
-from stcal.sfm.report.compare import compare
 from stcal.sfm.report.judgement import TESTED_BY
-from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import stcal
-from stcal.boards.board_file import load_board, save_board
-from stcal.boards.target_file import load_target, save_target
+from stcal import load_board, load_target, save_board, save_target
 from stcal.cli.main import LIBRARIES, main, main_sfm
 from stcal.io.cameras.read import read_camera
 from stcal.synthetic.designs import second_design

@@ -4,22 +4,18 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal import Camera, Rigid
 from stcal.boards.board_designs import AprilGridDesign, CharucoDesign, ChessboardDesign, CornerBoard
 from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.boards.dictionaries import dictionary_of
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
-from stcal.sfm import run
+from stcal.sfm import compare, load_run, run
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.run_options import require_dots
-from stcal.sfm.runs.saved import load_run
+from stcal.synthetic import Scene, SceneOptions, make_scene, second_design
 from stcal.synthetic.dataset import image_name, write_dataset
-from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm
 from tests.outcome import refuses
 

@@ -8,12 +8,8 @@ from stcal.boards.board_file import board_toml, load_board
 from stcal.boards.target_file import load_target
 from stcal.io.cameras.read import read_camera
 from stcal.labels import DotLabel
-from stcal.sfm import run
-from stcal.sfm.camera.calibrate import calibrate_camera
-from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.saved import load_run
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
+from stcal.sfm import calibrate_camera, compare, load_run, run
+from stcal.synthetic import RenderOptions, write_dataset
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, second_design
 from tests.levels import FULL, SLOW
 from tests.outcome import refuses

@@ -8,14 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.design import BoardDesign, reference_target
-from stcal.geometry.camera import Camera
-from stcal.sfm import RunOptions, run
+from stcal import BoardDesign, Camera, reference_target
+from stcal.sfm import RunOptions, compare, crosscheck, load_run, run
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.interop.crosscheck import crosscheck
-from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.saved import load_run
 
 # Bounds of the issue: µm of faces 2, 4, 5 and of face 3, mdeg of the same, µm mean of circles after a rigid fit,
 # and the share of visible circles found.

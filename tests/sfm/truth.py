@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from stcal.design import reference_target
+from stcal import Rigid, reference_target
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.chain import face_frame
 
 

@@ -7,11 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from stcal.design import reference_board
-from stcal.geometry.camera import Camera
+from stcal import Camera, camera_prior, reference_board
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.rigid import Rigid, Similarity, align_similarity
-from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.files import json_text
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.faces_file import FacesFile

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.design import reference_target
-from stcal.geometry.rigid import Rigid
+from stcal import Rigid, reference_target
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal import CameraPrior, Rigid
 from stcal.geometry.normal_equations import free_motions
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.uncertainty import (

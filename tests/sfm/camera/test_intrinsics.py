@@ -12,12 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from stcal import camera_prior, reference_board
 from stcal.boards.board_designs import CharucoDesign
-from stcal.design import reference_board
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.plane import circle_image_offset
-from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera import intrinsics

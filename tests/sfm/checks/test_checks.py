@@ -12,6 +12,7 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import CircleLabel
+from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
@@ -22,10 +23,8 @@ from stcal.sfm.checks.board_checks import board_checks, radius_checks
 from stcal.sfm.checks.image_checks import UNEVEN_BY_CHANCE, evenness_check, moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Evidence, Trial, culprits, judge
 from stcal.sfm.checks.suite import run_checks
-from stcal.sfm.pipeline import run
 from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
 from stcal.sfm.report.run_page import checks_section
-from stcal.sfm.runs.run_options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.design import reference_target
-from stcal.geometry.rigid import Rigid
+from stcal import Rigid, reference_target
 from stcal.labels import DotLabel
 from stcal.sfm.data.group_model import Centres
 from stcal.sfm.data.patterns import patterns_of

@@ -11,9 +11,8 @@ from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labelling import label_single
-from stcal.synthetic.optics import ThinLens
+from stcal.synthetic import SceneOptions, ThinLens, make_scene
 from stcal.synthetic.render import RenderOptions, encode, render
-from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.board_views import find_board
 
 LENS = ThinLens(f_number=1.8, focal_mm=24.0, focus_mm=1150.0)

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal import BoardDesign, Camera, FaceDesign, Rigid, TargetDesign, reference_board, reference_target
 from stcal.sfm.detect.candidates import (
     BoardSighting,
     Candidates,

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.design import reference_board, reference_target
-from stcal.geometry.camera import Camera
+from stcal import Camera, reference_board, reference_target
 from stcal.sfm.detect import image as stage
 from stcal.sfm.detect.candidates import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.design import BoardDesign
+from stcal import BoardDesign, Rigid
 from stcal.errors import DetectionError
-from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
 from stcal.sfm.detect.candidates import BoardSighting
 from stcal.sfm.detect.detect_files import DetectedImage, require_upright

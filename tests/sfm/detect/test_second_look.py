@@ -5,8 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.design import reference_target
-from stcal.geometry.camera import Camera
+from stcal import Camera, reference_target
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.detect.candidates import EllipseOptions

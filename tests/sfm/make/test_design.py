@@ -5,13 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stcal.boards.board_file import load_board
+from stcal import InputError, TargetDesign, load_board
 from stcal.boards.target_file import load_target, target_toml
 from stcal.cli.sfm.design_commands import design as command
-from stcal.design import TargetDesign
-from stcal.errors import InputError
 from stcal.lookalikes import MIN_COMMON
-from stcal.sfm import make
+from stcal.sfm import PlanOptions, make, plan
 from stcal.sfm.detect.face_patterns import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import (
     HIDDEN,
@@ -26,7 +24,6 @@ from stcal.sfm.make import (
     size_of,
     unnamed_cases,
 )
-from stcal.sfm.planning.session import PlanOptions, plan
 from stcal.synthetic.designs import second_design
 from tests.outcome import refuses
 

@@ -19,10 +19,8 @@ from typer.testing import CliRunner
 
 from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
-from stcal.sfm import MeasureOptions, measure
-from stcal.sfm.adjust.faces_file import read_target
+from stcal.sfm import MeasureOptions, Tracker, measure, read_target
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of, served
-from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.measurement.pose_report import poses_file
 from tests.outcome import fails_with
 from tests.sfm.truth import true_poses

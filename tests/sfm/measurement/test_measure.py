@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.design import reference_target
+from stcal import CameraPrior, Rigid, reference_target
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.camera import intrinsic_basis
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.table import read_table
 from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.patterns import project_circles

@@ -10,9 +10,7 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from stcal.design import reference_board, reference_target
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal import Camera, Rigid, reference_board, reference_target
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, model_of
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import equations

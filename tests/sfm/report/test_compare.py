@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.design import reference_target
+from stcal import Rigid, reference_target
 from stcal.errors import InputError, InputNote
-from stcal.geometry.rigid import Rigid
 from stcal.io.table import COVARIANCE as COLUMNS
 from stcal.io.table import POSE, pose_cells
 from stcal.sfm.adjust.faces_file import read_target

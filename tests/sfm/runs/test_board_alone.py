@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal import Rigid, reference_board
 from stcal.boards.target_file import target_toml
-from stcal.design import reference_board
-from stcal.geometry.rigid import Rigid
 from stcal.sfm.detect.labelling import PlaneView, _numbered
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet

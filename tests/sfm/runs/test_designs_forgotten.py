@@ -4,15 +4,11 @@ import re
 
 import pytest
 
+from stcal import StcalError, reference_target
 from stcal.boards.target_file import target_toml
-from stcal.design import reference_target
-from stcal.errors import StcalError
 from stcal.sfm.detect.face_patterns import likeness_notes
 from stcal.sfm.pipeline import run
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.designs import second_design
-from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.synthetic import RenderOptions, SceneOptions, make_scene, second_design, write_dataset
 from tests.outcome import INPUT, assert_error
 
 pytestmark = pytest.mark.usefixtures("no_page")

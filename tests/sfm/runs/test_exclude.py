@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from stcal.io.images import chosen_images
-from stcal.sfm.adjust.faces_file import read_target
+from stcal.sfm import load_run, read_target
 from stcal.sfm.report.check import Check, ranked
-from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error, fails_with
 
 CHECKS_FAILED = 4

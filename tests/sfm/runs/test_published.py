@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.sfm.pipeline import run
+from stcal.sfm import RunOptions, run
 from stcal.sfm.runs import comparisons
 from stcal.sfm.runs.comparisons import AS_PUBLISHED, STEPS
-from stcal.sfm.runs.run_options import RunOptions
 from tests.outcome import fails_with
 
 

@@ -10,10 +10,9 @@ from stcal.errors import InputNote
 from stcal.io.cameras.camera_model import model_of
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import CAMERA, REFINED_CAMERA
+from stcal.sfm import RunOptions, run
 from stcal.sfm.camera.intrinsics import model_parameters
 from stcal.sfm.mapping.body import unknown_lens
-from stcal.sfm.pipeline import run
-from stcal.sfm.runs.run_options import RunOptions
 from tests.levels import sampled
 
 pytestmark = pytest.mark.usefixtures("no_page")

@@ -14,11 +14,9 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
-from stcal.sfm import run
-from stcal.sfm.adjust.faces_file import read_target
+from stcal.sfm import RunOptions, read_target, run
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, refuses
