@@ -1,4 +1,6 @@
-"""Public names are documented, their constructors are as strict as readers of files, and values show themselves."""
+"""Public names are documented, their constructors are as strict as readers of files, and values show themselves.
+Folders can be seen at a glance, names stand for one thing, and another distribution ``stcal`` in the same environment
+is refused. pyproject.toml says who imports whom."""
 
 import copy
 import dataclasses
@@ -7,9 +9,12 @@ import inspect
 import os
 import pickle
 import re
+import shutil
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -18,6 +23,7 @@ import pytest
 import stcal
 from stcal import Camera, InputError, errors, handeye, locate, register, robot, sfm, synthetic
 from stcal.design import TargetDesign, reference_board, reference_target
+from stcal.errors import fault
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.handeye import HandEyePoses
 from stcal.locate import SeenTags
@@ -185,7 +191,7 @@ def test_no_field_takes_a_value_of_another_type(made):
 
 @pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
 def test_a_copy_of_a_value_is_equal_and_a_value_shows_itself_in_a_line(made):
-    """Results with many values: in `tests/sfm/test_pipeline.py`, and by what they are made of."""
+    """Results with many values: in `tests/sfm/runs/test_results.py`, and by what they are made of."""
     for again in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert (again, hash(again)) == (made, hash(made))
     assert len(repr(made)) < 600
@@ -229,3 +235,42 @@ def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     monkeypatch.delenv(errors.COMMAND_LINE)
     refuses("E-OPTION-RANGE … flatness_mm 1e+09", RunOptions(flatness_mm=1e9).settled, reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
+
+
+ROOT = Path(stcal.__file__).parent
+FILES = sorted(path.relative_to(ROOT) for path in ROOT.rglob("*.py"))
+MOST_FILES = 14
+"""Most files of a folder: what can be seen at a glance."""
+MOST_ENTRIES = 16  # most folders and files of `sfm/`
+
+
+def test_folders_can_be_seen_at_a_glance_and_names_stand_for_one_thing():
+    counts = Counter(path.parent for path in FILES)
+    assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
+    entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
+    assert len(entries) <= MOST_ENTRIES
+    assert [path for path in FILES if path.stem == path.parent.name] == []
+    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
+    assert {stem: n for stem, n in stems.items() if n > 1} == {}
+    for system in SYSTEMS[:5]:
+        names = importlib.import_module(f"stcal.{system}").__all__
+        assert {each.stem for each in (ROOT / system).iterdir()} & set(names) == set()
+
+
+def test_a_package_by_itself_is_no_fault(tmp_path):
+    (tmp_path / "stereo_target_calibration-0.1.0.dist-info").mkdir()
+    assert fault(tmp_path / "stcal") == ""
+
+
+def test_another_distribution_beside_it_is_refused_at_import(tmp_path):
+    package = tmp_path / "stcal"
+    package.mkdir()
+    for name in ("__init__.py", "errors.py"):
+        shutil.copy(Path(stcal.__file__).with_name(name), package)
+    (tmp_path / "stcal-1.20.0.dist-info").mkdir()
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import stcal"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith(f"ImportError: {package}: the distribution stcal 1.20.0")
+    assert "pip uninstall stcal" in last
