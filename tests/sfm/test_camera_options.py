@@ -1,5 +1,4 @@
-"""Walked over all commands: ``--camera-name`` of those that read cameras, and the page of those that write one, in a
-browser: no wider than its window, a quiet console, the answer."""
+"""``--camera-name`` of every command that reads cameras, walked over all."""
 
 import inspect
 import sys
@@ -10,9 +9,8 @@ from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.io.cameras import foreign_lenses
 from tests.commands import CALLS, COMMANDS, Call
-from tests.fuzzing.judged import OUT, in_process, lay_out
+from tests.fuzzing.judged import lay_out
 from tests.outcome import assert_error, ended
-from tests.report.browser import faults, opened, show, sideways_px
 
 MORE = (
     Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --camera @data/cameras.txt"),
@@ -76,31 +74,3 @@ def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
     monkeypatch.setattr(foreign_lenses, "one_of", chosen)
     assert_error(call(each, "--camera-name", "2", change=two_cameras(each)), 2, "chosen: 2")
     assert taken == ["2"]
-
-
-PAGES = {call.command: call for call in reversed(CALLS) if ">page.html" in call.words}
-WITHOUT_ANSWER = {"robot axes", "robot evaluate", "robot verify", "robot design"}
-"""What they print is not used as a whole: each row has a verdict of its own, or none."""
-
-
-@pytest.fixture(scope="module")
-def chrome():
-    with opened() as browser:
-        yield browser
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("call", PAGES.values(), ids=PAGES)
-def test_a_page_fits_a_phone_and_a_screen(chrome, stock, tmp_path, call: Call):
-    lay_out(stock, tmp_path / "case", call, earlier=False)
-    outcome = in_process(call, "stcal", tmp_path / "case")
-    assert outcome.code == call.code, outcome
-    for theme in ("light", "dark"):
-        chrome.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": theme}]}
-        )
-        for width in (420, 1280):
-            show(chrome, tmp_path / "case" / OUT / "page.html", width)
-            assert (sideways_px(chrome), faults(chrome)) == (0, [])
-    head = chrome.execute_script("return document.body.innerText.split('\\n\\n').slice(0, 4).join(' ')")
-    assert ("use it?" in head or "used?" in head) != (call.command in WITHOUT_ANSWER), head

@@ -14,6 +14,7 @@ from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, perform, went_through
 from tests.levels import FULL, sampled
+from tests.report.browser import faults, opened, show, sideways_px
 
 pytestmark = pytest.mark.slow
 KNOWN_SEED = 20
@@ -49,7 +50,7 @@ def shortest_first() -> list[tuple[int, str]]:
     return [(n, calls[n].command) for n in sorted(range(CASES), key=lambda n: calls[n].seconds)]
 
 
-def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, case):
+def test_a_case_of_every_command_but_long_ones_and_of_every_kind_of_file_is_judged(stock, case):
     cases = shortest_first()
     first = {command: n for n, command in reversed(cases)}
     found = spoiled(stock, case, first.values())
@@ -59,9 +60,6 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, case):
     while missing := missing - {suffix for each in found for suffix in BY_SUFFIX if f"{suffix}: " in each.said}:
         found += spoiled(stock, case, [rest.pop(0)], both=False)
     assert len(found) < 2 * len(first)
-
-
-def test_the_cases_are_of_every_command_but_long_ones():
     left_out = set(COMMANDS) - {command for _, command in shortest_first()}
     assert [c.command for c in CALLS if c.command in left_out and c.seconds <= BRIEF_S] == []
     assert len(left_out) < len(COMMANDS) // 4
@@ -94,12 +92,36 @@ def test_a_mistake_is_told(stock, case, name):
 
 ELSEWHERE = {"sfm demo", "sfm detect", "sfm advise"}
 """Commands whose good call is made elsewhere in `.ci/run`: from the wheel, and in tutorials."""
-FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | ELSEWHERE]
+PAGES = {call.command: n for n, call in reversed([*enumerate(CALLS)]) if ">page.html" in call.words}
+WITHOUT_ANSWER = {"robot axes", "robot evaluate", "robot verify", "robot design"}
+"""What they print is not used as a whole: each row has a verdict of its own, or none."""
+SEEN = ELSEWHERE | PAGES.keys()
+FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | SEEN]
 
 
 @pytest.mark.parametrize("number", sampled(range(len(CALLS)), kept=FIRST), ids=[call.command for call in CALLS])
 def test_calls_go_through(stock, case, number):
     assert went_through(stock, case, number).failures == ()
+
+
+@pytest.fixture(scope="module")
+def chrome():
+    with opened() as browser:
+        yield browser
+
+
+@pytest.mark.parametrize("command", PAGES)
+def test_a_call_goes_through_and_its_page_fits_a_phone_and_a_screen(chrome, stock, case, command):
+    """No wider than its window, a quiet console, the answer."""
+    assert went_through(stock, case, PAGES[command]).failures == ()
+    for theme in ("light", "dark"):
+        scheme = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
+        chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", scheme)
+        for width in (420, 1280):
+            show(chrome, case / OUT / "page.html", width)
+            assert (sideways_px(chrome), faults(chrome)) == (0, [])
+    head = chrome.execute_script("return document.body.innerText.split('\\n\\n').slice(0, 4).join(' ')")
+    assert ("use it?" in head or "used?" in head) != (command in WITHOUT_ANSWER), head
 
 
 INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")

@@ -84,8 +84,8 @@ def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations
     assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0
 
 
-def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, group):
-    """One more column in the full equations: its σ is the score's, and so is its estimate."""
+def test_scores_are_estimates_beside_all_others(network, full, group):
+    """By the general equations, and by those of one image of one parameter for each of its coordinates."""
     model, rng = group[0], np.random.default_rng(0)
     column = rng.normal(size=(len(model.image_index), 2, 1))
     test = solve_score(*network.score(column))
@@ -96,10 +96,6 @@ def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, g
     assert test.estimate[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(test.covariance[0, 0]))
     assert test.freedom == 1
     assert test.statistic == pytest.approx(test.estimate[0] ** 2 / test.covariance[0, 0])
-
-
-def test_what_an_image_explains_is_what_leaving_it_out_changes(network):
-    """One parameter for each of its coordinates, by the general equations and by those of one image."""
     image = 3
     rows = np.flatnonzero(network.model.image_index == image)
     k = np.arange(len(rows))
@@ -109,6 +105,11 @@ def test_what_an_image_explains_is_what_leaving_it_out_changes(network):
     general = network.score(columns)
     np.testing.assert_allclose(normal, general[0], atol=1e-9)
     np.testing.assert_allclose(right, general[1], atol=1e-9)
+    normal = np.array([[2.0, 2.0], [2.0, 2.0]])
+    test = solve_score(normal, np.array([1.0, 1.0]))
+    assert test.freedom == 1
+    assert test.statistic == pytest.approx(0.5)
+    assert normal @ test.estimate == pytest.approx([1.0, 1.0])
 
 
 def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
@@ -124,14 +125,6 @@ def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
     statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]
     assert np.argmax(statistics) == image
     assert solve_score(normal[image], right[image]).estimate[0] == pytest.approx(1e-3, rel=0.05)
-
-
-def test_directions_without_information_count_for_nothing():
-    normal = np.array([[2.0, 2.0], [2.0, 2.0]])
-    test = solve_score(normal, np.array([1.0, 1.0]))
-    assert test.freedom == 1
-    assert test.statistic == pytest.approx(0.5)
-    assert normal @ test.estimate == pytest.approx([1.0, 1.0])
 
 
 def test_squares_of_observations_are_chi_square(network, full):
@@ -211,26 +204,20 @@ def board_xyz():
     return np.column_stack([BOARD.xy_mm(), np.zeros(63)])
 
 
-@pytest.mark.parametrize("missing", [0, 5])
-def test_both_scales_are_exact_without_noise_whichever_dots_are_missing(missing):
-    keep = [i for i in range(63) if not missing or i % missing]
-    scale = find_scale(model_of(board_xyz()[keep], [BOARD.labels()[i] for i in keep]), BOARD)
-    assert scale.mm_per_unit == pytest.approx(25.0, rel=1e-12)
-    # The mean over pairs, 2/(n(n−1)): the printed 1/(n−1)! would give a number near zero.
-    assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
-    assert scale.rows == (0, 6)
-    assert scale.rms_mm() < 1e-10
-
-
-def test_rows_use_the_first_and_the_last_mapped_row_only():
+def test_scales_are_exact_without_noise_and_follow_the_boards_sigma():
+    for missing in (0, 5):
+        keep = [i for i in range(63) if not missing or i % missing]
+        scale = find_scale(model_of(board_xyz()[keep], [BOARD.labels()[i] for i in keep]), BOARD)
+        assert scale.mm_per_unit == pytest.approx(25.0, rel=1e-12)
+        # The mean over pairs, 2/(n(n−1)): the printed 1/(n−1)! would give a number near zero.
+        assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
+        assert scale.rows == (0, 6)
+        assert scale.rms_mm() < 1e-10
     xyz = board_xyz()
     xyz[9:54] += np.random.default_rng(0).normal(0, 1, (45, 3))  # the rows between are far off
     scale = find_scale(model_of(xyz, BOARD.labels()), BOARD)
     assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
     assert abs(scale.mm_per_unit / 25 - 1) > 1e-6
-
-
-def test_residuals_and_the_spread_of_lambda_follow_the_boards_sigma():
     rng = np.random.default_rng(0)
     ratios, residuals = [], []
     for _ in range(300):
@@ -240,10 +227,7 @@ def test_residuals_and_the_spread_of_lambda_follow_the_boards_sigma():
     assert 0.85 < np.std(ratios) < 1.15  # 300 draws: ± 4 %
     # 189 coordinates less 7 parameters: 5 µm · √3 · √(182/189).
     assert np.mean(residuals) == pytest.approx(0.0085, rel=0.03)
-
-
-@pytest.mark.parametrize(("keep", "reason"), [(range(3), "E-SCALE-FEW-DOTS … 3 … 4"), (range(9), "E-SCALE-COLLINEAR")])
-def test_too_little_of_the_board(keep, reason):
-    labels = [BOARD.labels()[i] for i in keep]
-    with fails_with(reason):
-        find_scale(model_of(board_xyz()[list(keep)], labels), BOARD)
+    for keep, reason in ((range(3), "E-SCALE-FEW-DOTS … 3 … 4"), (range(9), "E-SCALE-COLLINEAR")):
+        labels = [BOARD.labels()[i] for i in keep]
+        with fails_with(reason):
+            find_scale(model_of(board_xyz()[list(keep)], labels), BOARD)

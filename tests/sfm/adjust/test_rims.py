@@ -61,25 +61,19 @@ def test_no_rim_is_found_where_there_is_none(scene, look):
     assert rim_check(rims, 0.002, {}).verdict == "passed"
 
 
-def test_rims_that_are_not_seen_or_harm_nothing_are_no_fault():
+def test_rims_that_harm_nothing_are_no_fault_and_need_the_joint_adjustment(scene):
     """It is seen with certainty, and moves faces by less than their σ."""
     assert rim_check({}, 0.002, {}).verdict == "not possible"
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02, {}).verdict == "passed"
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002, {}).verdict == "suspicious"
-
-
-@pytest.mark.parametrize(
-    ("options", "refusal"),
-    [
+    for options, refusal in (
         ({"solve": "chain", "rim": True}, "E-RIM-SOLVE … --solve joint"),
         ({"solve": "paper", "rim": True}, "E-RIM-SOLVE … --solve joint"),
         ({"solve": "chain", "refine_camera": True}, "E-OPTION-NEEDS … --solve"),
-    ],
-)
-def test_rims_and_refined_intrinsics_need_the_joint_adjustment(scene, options, refusal):
-    with fails_with(refusal):
-        RunOptions(**options).settled(scene.target)
-    assert RunOptions(rim=True).settled(scene.target).rim
+    ):
+        with fails_with(refusal):
+            RunOptions(**options).settled(scene.target)
+        assert RunOptions(rim=True).settled(scene.target).rim
 
 
 def test_designs_of_target_and_board_state_rims(scene, tmp_path):
@@ -101,14 +95,11 @@ def test_designs_of_target_and_board_state_rims(scene, tmp_path):
     assert "0.3 mm stated" in passed.reason
 
 
-def test_a_rim_hides_what_is_not_in_common_of_two_discs():
+def test_a_rim_hides_what_is_not_in_common_of_two_discs_and_rims_of_dots_move_the_board_alone(scene):
     """Of the radius by area. That of the fit, which follows the rim, is less by up to 2 %."""
     apart = np.array([0.05, 0.1, 0.15])
     area = 2 * np.arccos(apart / 2) - apart / 2 * np.sqrt(4 - apart**2)
     np.testing.assert_allclose(lost_radius_mm(0.1, 10 * 5.0 * apart, 5.0) / 5.0, 1 - np.sqrt(area / np.pi), rtol=0.02)
-
-
-def test_rims_of_dots_move_the_board_and_no_face(scene):
     models = true_models(scene, observe(scene, 0.01, np.random.default_rng(0)))
     seen, surface = (adjusted(models, replace(scene.board, rim_mm=h), scene.camera).result() for h in (0.0, 0.3))
     np.testing.assert_allclose(surface.xyz_model, seen.xyz_model, atol=1e-6)

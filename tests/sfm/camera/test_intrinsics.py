@@ -125,7 +125,7 @@ def test_models_of_fewer_and_of_more_parameters():
     assert 0.001 < moved < 0.5
 
 
-def test_intrinsics_that_are_held_stay_and_the_poses_follow():
+def test_intrinsics_that_are_held_stay_and_closed_form_finds_the_focal_length_else_several_are_tried(monkeypatch):
     wrong = replace(TRUE, focal=[2795.0, 2784.0])
     views = views_of(np.random.default_rng(8), count=6)
     held = adjust_intrinsics(views, BOARD, wrong, "OPENCV", held=True)
@@ -134,9 +134,6 @@ def test_intrinsics_that_are_held_stay_and_the_poses_follow():
     assert (np.abs(error(free)) < 5 * free.sigma()).all()
     # 5 px of 2790 are 1 px at the edge of a board that fills the image, and some of it no pose can take up.
     assert np.sqrt((held.residuals_px() ** 2).mean()) > 2 * np.sqrt((free.residuals_px() ** 2).mean())
-
-
-def test_closed_form_finds_the_focal_length_and_where_it_gives_none_several_are_tried(monkeypatch):
     # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
     pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
     start = intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")

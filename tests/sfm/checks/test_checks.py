@@ -104,12 +104,18 @@ def not_passed(checks):
     return {key: check.verdict for key, check in checks.items() if check.verdict not in ("passed", "not possible")}
 
 
-def test_an_honest_run_passes(full_scene, lab):
+def test_honest_runs_of_labels_and_of_photographs_pass(full_scene, lab, small_run):
     checks = lab.check(full_scene, lab.observe(full_scene))
     assert not_passed(checks) == {}
     assert {key for key, check in checks.items() if check.verdict == "not possible"} == JOINT
     control = checks["control"].measured
     assert 20 < max(m.value for m in control if m.unit == "µm") < 300  # tens of µm, at residuals of a hundredth of a px
+    checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
+    assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
+    assert len({check["key"] for check in checks}) == len(checks) == 20
+    assert all(set(check) == set(checks[0]) for check in checks)
+    assert "19 " not in count_verdicts(map(Check.read, checks))
+    assert "not possible" in checks_section(checks)[0]
 
 
 def test_the_joint_result_is_checked_by_its_parts(labels_only, lab, monkeypatch):
@@ -324,15 +330,6 @@ def test_an_adjustment_that_has_not_settled_is_flagged(lab, monkeypatch):
     assert checks["agreement"].verdict == "suspicious"
     assert checks["agreement"].names == ("last step",)
     assert checks["agreement"].remedy
-
-
-def test_a_run_of_photographs_passes(small_run):
-    checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
-    assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
-    assert len({check["key"] for check in checks}) == len(checks) == 20
-    assert all(set(check) == set(checks[0]) for check in checks)
-    assert "19 " not in count_verdicts(map(Check.read, checks))
-    assert "not possible" in checks_section(checks)[0]
 
 
 def test_verdicts_are_tests_of_significance_and_what_larger_sigma_cover_enlarges_them():

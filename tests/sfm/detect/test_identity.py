@@ -1,4 +1,5 @@
-"""Faces and boards among candidates, without pixels: naming, hiding, reflections, clutter, numbering."""
+"""Faces and boards among candidates: naming, hiding, reflections, clutter, numbering; the published rules on drawn
+patterns; and the board's grid among the outlines of a photograph."""
 
 from dataclasses import replace
 
@@ -8,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal import BoardDesign, Camera, FaceDesign, Rigid, TargetDesign, reference_board, reference_target
+from stcal.io.cameras.read import read_camera
+from stcal.io.images import decode
 from stcal.sfm.detect.candidates import (
     BoardSighting,
     Candidates,
@@ -16,9 +19,10 @@ from stcal.sfm.detect.candidates import (
     ImageDetection,
     find_ellipses,
 )
-from stcal.sfm.detect.dot_grid import by_rings, find_boards
+from stcal.sfm.detect.dot_grid import by_rings, contradiction, find_boards
 from stcal.sfm.detect.face_patterns import find_faces, find_mirrored, mirror_images
 from stcal.sfm.detect.image import image_corners
+from stcal.sfm.detect.published import EQUAL_SIGMA_PX, PublishedPattern, detect_published
 from tests.outcome import refuses
 from tests.sfm.detect.test_arrangement import centres_of
 from tests.support.circle_images import circle_conic, ellipse_of_conic
@@ -74,20 +78,23 @@ def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
     assert found.rows.tolist() == found.circles.tolist() == list(range(10))
 
 
-@pytest.mark.parametrize("hidden", ["1", "a", "126", "457b"])
-def test_up_to_four_hidden_circles_leave_the_name(hidden):
-    """Six circles are left at least: four make a homography, two confirm it, and nothing else reads like them."""
-    (found,), _ = found_in(face_ellipses("4", pose(50, 120, 30), hidden))
-    assert found.face == "4"
-    assert {TARGET.face("4").ids[i] for i in set(range(10)) - set(found.circles)} == set(hidden)
-
-
-def test_a_circle_of_another_size_is_left_out_of_its_face():
-    """Twice as large as designed, on circles of 20 px, where the outline's error is a hundredth of it."""
+def test_which_circles_a_face_needs_for_its_name():
+    """Six circles are left at least: four make a homography, two confirm it, and nothing else reads like them. One
+    twice as large as designed is left out, of circles of 20 px, where the outline's error is a hundredth of it. Nothing
+    is named without the circle that tells the faces apart or five others, nor by a design without faces."""
+    for hidden in ("1", "a", "126", "457b"):
+        (found,), _ = found_in(face_ellipses("4", pose(50, 120, 30), hidden))
+        assert found.face == "4"
+        assert {TARGET.face("4").ids[i] for i in set(range(10)) - set(found.circles)} == set(hidden)
     face, at = TARGET.face("3"), pose(30, 20, 100, depth=500.0)
     radius = face.radius_mm * np.where(np.array(face.ids) == "2", 2.0, 1.0)
     (found,), _ = found_in(ellipses_of(at, face.xy_mm, radius))
     assert [face.ids[i] for i in set(range(10)) - set(found.circles)] == ["2"]
+    faces, unnamed = found_in(face_ellipses("3", pose(), hidden="c"))
+    assert faces == []
+    assert {each.face for several in unnamed for each in several} > {"3"}
+    assert found_in(face_ellipses("3", pose(), hidden="126a4"))[0] == []
+    assert found_in(face_ellipses("1", pose()), TargetDesign("none", "bright", ())) == ([], [])
 
 
 @pytest.mark.parametrize(("dots", "repeated"), [(63, True), (51, True), (50, False)])
@@ -99,21 +106,25 @@ def test_a_second_board_counts_if_it_is_of_similar_size(dots, repeated):
     assert (found.board is None) == repeated
 
 
-def test_without_the_circle_that_tells_the_faces_apart_or_five_others_nothing_is_named():
-    """Nor by a design without faces."""
-    faces, unnamed = found_in(face_ellipses("3", pose(), hidden="c"))
-    assert faces == []
-    assert {each.face for several in unnamed for each in several} > {"3"}
-    assert found_in(face_ellipses("3", pose(), hidden="126a4"))[0] == []
-    assert found_in(face_ellipses("1", pose()), TargetDesign("none", "bright", ())) == ([], [])
-
-
-@pytest.mark.parametrize("ratio", [0.15, 5.0])
-def test_faces_differ_in_brightness(ratio):
+def test_faces_of_any_light_number_and_circles_are_found_together_but_one_that_looks_the_same_turned(monkeypatch):
     """Light on one face is unrelated to that on another."""
-    dim = face_ellipses("5", pose(30, 0, 0, x=200), contrast=40.0)
-    other = face_ellipses("2", pose(40, 10, 0, x=-250), contrast=40.0 * ratio)
-    assert {r.face for r in found_in(Ellipses.concatenate([dim, other]))[0]} == {"5", "2"}
+    for ratio in (0.15, 5.0):
+        dim = face_ellipses("5", pose(30, 0, 0, x=200), contrast=40.0)
+        other = face_ellipses("2", pose(40, 10, 0, x=-250), contrast=40.0 * ratio)
+        assert {r.face for r in found_in(Ellipses.concatenate([dim, other]))[0]} == {"5", "2"}
+    faces, _ = found_in(Ellipses.concatenate([face_ellipses("1", pose(x=-200)), face_ellipses("1", pose(x=150))]))
+    assert [r.face for r in faces] == ["1", "1"]
+    face = TARGET.face("2")
+    few = FaceDesign("few", tuple("abcde"), [[0, 0], [31, 0], [64, 7], [5, 38], [36, 52]], [5.0] * 5, "a", "c", "d")
+    target = TargetDesign("mixed", "bright", (few, face))
+    own = ellipses_of(pose(20, 30, 40, x=200), few.xy_mm, few.radius_mm)
+    both = Ellipses.concatenate([own, face_ellipses("2", pose(40, 10, 0, x=-250))])
+    assert {reading.face: len(reading.rows) for reading in found_in(both, target)[0]} == {"few": 5, "2": 10}
+    monkeypatch.setattr("stcal.design.require_distinct", lambda *_: None)  # which refuses the design first
+    xy = [[0, 0], [30, 0], [60, 0], [0, 40], [30, 40], [60, 40]]
+    square = FaceDesign("s", tuple("abcdef"), xy, [5.0] * 6, "a", "c", "d")
+    target = TargetDesign("symmetric", "bright", (square,))
+    assert found_in(ellipses_of(pose(), square.xy_mm, square.radius_mm), target)[0] == []
 
 
 @pytest.mark.parametrize("radius", [4.0, 5.66, 8.0])
@@ -133,39 +144,14 @@ def test_random_discs_are_no_faces_and_hide_none():
     assert (found.rows >= 150).all()
 
 
-def test_a_face_in_view_twice_has_two_readings():
-    faces, _ = found_in(Ellipses.concatenate([face_ellipses("1", pose(x=-200)), face_ellipses("1", pose(x=150))]))
-    assert [r.face for r in faces] == ["1", "1"]
-
-
-def test_which_faces_a_mirror_makes_of_faces():
+def test_a_mirrored_image_is_told_by_a_face_without_a_mirror_image():
     """Swapping x and y turns the pattern of face 5 into that of face 3, and that of face 4 into that of face 2."""
     assert mirror_images(TARGET) == {"2": ("4",), "4": ("2",), "3": ("5",), "5": ("3",)}
-
-
-@pytest.mark.parametrize("face_id", ["1", "2"])
-def test_a_mirrored_image_is_told_by_a_face_without_a_mirror_image(face_id):
-    faces = face_ellipses("1", pose(30, 0, 0, x=200)), face_ellipses(face_id, pose(40, 10, 0, x=-250))
-    candidates = Candidates(Ellipses.concatenate([*faces]), CAMERA)
-    for each, mirrored in ((candidates, set()), (candidates.mirrored(), {"1"})):
-        assert set(find_mirrored(each, TARGET, find_faces(each, TARGET)[0])) == mirrored
-
-
-def test_faces_of_few_and_of_many_circles_are_found_together():
-    face = TARGET.face("2")
-    few = FaceDesign("few", tuple("abcde"), [[0, 0], [31, 0], [64, 7], [5, 38], [36, 52]], [5.0] * 5, "a", "c", "d")
-    target = TargetDesign("mixed", "bright", (few, face))
-    own = ellipses_of(pose(20, 30, 40, x=200), few.xy_mm, few.radius_mm)
-    both = Ellipses.concatenate([own, face_ellipses("2", pose(40, 10, 0, x=-250))])
-    assert {reading.face: len(reading.rows) for reading in found_in(both, target)[0]} == {"few": 5, "2": 10}
-
-
-def test_a_face_that_looks_the_same_after_half_a_turn_is_never_named(monkeypatch):
-    monkeypatch.setattr("stcal.design.require_distinct", lambda *_: None)  # which refuses the design first
-    xy = [[0, 0], [30, 0], [60, 0], [0, 40], [30, 40], [60, 40]]
-    square = FaceDesign("s", tuple("abcdef"), xy, [5.0] * 6, "a", "c", "d")
-    target = TargetDesign("symmetric", "bright", (square,))
-    assert found_in(ellipses_of(pose(), square.xy_mm, square.radius_mm), target)[0] == []
+    for face_id in ("1", "2"):
+        faces = face_ellipses("1", pose(30, 0, 0, x=200)), face_ellipses(face_id, pose(40, 10, 0, x=-250))
+        candidates = Candidates(Ellipses.concatenate([*faces]), CAMERA)
+        for each, mirrored in ((candidates, set()), (candidates.mirrored(), {"1"})):
+            assert set(find_mirrored(each, TARGET, find_faces(each, TARGET)[0])) == mirrored
 
 
 # Boards ---------------------------------------------------------------------------------------------------------
@@ -188,43 +174,32 @@ def numberings_of(reading, keep) -> list[dict]:
     return [{keep[c]: tuple(rc) for c, rc in zip(reading.rows, own, strict=True)} for own in reading.numberings]
 
 
-@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (65, 200, 30)])
-def test_a_plain_board_is_numbered_up_to_half_a_turn(tilt, azimuth, roll):
-    keep, ellipses = board_ellipses(BOARD, pose(tilt, azimuth, roll, facing=False))
-    (reading,) = find(ellipses, BOARD)
-    assert reading.numberings.shape == (2, 63, 2)
-    truth = {i: divmod(i, 9) for i in range(63)}
-    turned = {i: (6 - r, 8 - c) for i, (r, c) in truth.items()}
-    both = numberings_of(reading, keep)
-    assert truth in both
-    assert turned in both
-    square = BoardDesign(7, 7, 30.0, 7.5, "bright", 0.005)
-    (reading,) = find(board_ellipses(square, pose(tilt, azimuth, roll, facing=False))[1], square)
-    assert len(reading.numberings) == 4
-
-
-@pytest.mark.parametrize("corner", [(0, 0), (0, 9)])
-def test_a_larger_corner_dot_settles_the_numbering(corner):
-    board = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner, 7.5)
-    keep, ellipses = board_ellipses(board, pose(40, 60, 70, facing=False))
-    (reading,) = find(ellipses, board)
-    assert numberings_of(reading, keep) == [{i: divmod(i, 10) for i in range(100)}]
-
-
-@pytest.mark.parametrize(
-    ("hidden", "count"),
-    [({(0, 0), (3, 4)}, 2), ({(r, 0) for r in range(7)}, 4)],  # nothing tells on which side a hidden column was
-)
-def test_hidden_dots_leave_the_numberings_open_that_fit(hidden, count):
-    keep, ellipses = board_ellipses(BOARD, pose(20, 80, 0, facing=False), hidden)
-    (reading,) = find(ellipses, BOARD)
-    numberings = numberings_of(reading, keep)
-    assert {i: divmod(i, 9) for i in keep} in numberings
-    assert len(numberings) == count
-
-
-def test_a_strip_cut_off_by_the_image_is_known():
-    """The column beyond the border is the missing one: the other side is in view and empty."""
+def test_a_board_has_all_numberings_that_fit():
+    """Two or four up to half a turn, one with a larger corner dot. Hidden dots leave those open that fit; of a strip
+    cut off by the image, the column beyond the border is the missing one: the other side is in view and empty."""
+    for tilt, azimuth, roll in ((0, 0, 0), (65, 200, 30)):
+        keep, ellipses = board_ellipses(BOARD, pose(tilt, azimuth, roll, facing=False))
+        (reading,) = find(ellipses, BOARD)
+        assert reading.numberings.shape == (2, 63, 2)
+        truth = {i: divmod(i, 9) for i in range(63)}
+        turned = {i: (6 - r, 8 - c) for i, (r, c) in truth.items()}
+        both = numberings_of(reading, keep)
+        assert truth in both
+        assert turned in both
+        square = BoardDesign(7, 7, 30.0, 7.5, "bright", 0.005)
+        (reading,) = find(board_ellipses(square, pose(tilt, azimuth, roll, facing=False))[1], square)
+        assert len(reading.numberings) == 4
+    for corner in ((0, 0), (0, 9)):
+        board = BoardDesign(10, 10, 20.0, 5.0, "dark", 0.05, corner, 7.5)
+        keep, ellipses = board_ellipses(board, pose(40, 60, 70, facing=False))
+        (reading,) = find(ellipses, board)
+        assert numberings_of(reading, keep) == [{i: divmod(i, 10) for i in range(100)}]
+    for hidden, count in (({(0, 0), (3, 4)}, 2), ({(r, 0) for r in range(7)}, 4)):
+        keep, ellipses = board_ellipses(BOARD, pose(20, 80, 0, facing=False), hidden)
+        (reading,) = find(ellipses, BOARD)
+        numberings = numberings_of(reading, keep)
+        assert {i: divmod(i, 9) for i in keep} in numberings
+        assert len(numberings) == count
     camera_from_board = pose(0, 0, 0, x=-365, facing=False)
     keep, ellipses = board_ellipses(BOARD, camera_from_board)
     inside = ellipses.centre_px[:, 0] - ellipses.radius_px() > 0
@@ -264,3 +239,93 @@ def test_rings_at_other_places_than_stated_are_refused():
     assert len(by_rings(reading, stated, grey, camera, dots.xy).numberings) == 1
     further = replace(stated, rings=tuple((row, column + 1) for row, column in stated.rings))
     refuses("E-RINGS-ELSEWHERE … [2, 4], [3, 2], [3, 3]", by_rings, reading, further, grey, camera, dots.xy)
+
+
+BITS = 8
+
+
+def drawn(ellipses, grey=200):
+    image = np.full((CAMERA.height, CAMERA.width), 20, np.uint8)
+    for centre, shape in zip(ellipses.centre_px, ellipses.shape_px, strict=True):
+        values, axes = np.linalg.eigh(shape)
+        angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
+        scaled = [tuple(np.round(2**BITS * np.array(v)).astype(int).tolist()) for v in (centre, values[::-1])]
+        cv2.ellipse(image, *scaled, angle, 0, 360, grey, -1, cv2.LINE_AA, BITS)
+    return image
+
+
+def detect(image, target=TARGET):
+    return detect_published(image, CAMERA, target, None, EllipseOptions())
+
+
+def test_faces_as_published_but_where_perspective_breaks_the_name():
+    """A square seen from the side: what was perpendicular is not."""
+    for face_id in ("1", "5"):
+        ellipses = face_ellipses(face_id, pose(5, 40, 30.0 * int(face_id)))
+        found = detect(drawn(ellipses))
+        assert [each.face for each in found.faces] == [face_id]
+        assert found.notes == ()
+        labels = found.faces[0].circles
+        seen = found.centres.centre_px[found.faces[0].rows]
+        assert np.abs(seen - ellipses.centre_px[labels]).max() < 0.15  # of a contour, to what pixels leave
+        assert (found.centres.covariance_px2 == EQUAL_SIGMA_PX**2 * np.eye(2)).all()
+    found = detect(drawn(face_ellipses("1", pose(60, 0, 0))))
+    assert [each.face for each in found.faces] == ["1"]
+    (note,) = found.notes
+    assert note.startswith("a pattern about (")
+    assert "perspective breaks the published name" in note
+    assert "its own plane says face 1, which was taken" in note
+
+
+@pytest.mark.parametrize(
+    ("hidden", "moved", "said"),
+    [
+        ("3", "", "circle 3 not found in its direction"),
+        ("6", "", "circle 6 not found in its direction"),
+        ("c", "", "0 small circles beside circle 7, 1 needed"),
+        ("", "2", "radii off in the plane of the others, 0.25 allowed"),  # half a radius along its line
+    ],
+)
+def test_a_pattern_that_lacks_a_circle_or_has_one_out_of_place_is_no_face(hidden, moved, said):
+    ellipses = face_ellipses("2", pose(10, 40), tuple(hidden))
+    centre = ellipses.centre_px.copy()
+    for i in [TARGET.face("2").ids.index(circle) for circle in moved]:
+        centre[i] += 0.5 * ellipses.radius_px()[i] * (centre[i] - centre[0]) / np.linalg.norm(centre[i] - centre[0])
+    found = detect(drawn(replace(ellipses, centre_px=centre)))
+    assert found.faces == ()
+    (note,) = found.notes
+    assert said in note
+    assert note.endswith("left out by the published rules")
+
+
+def test_the_published_rules_know_the_reference_design_alone():
+    """Dot product zero: 1; positive: 2 and 4, negative: 3 and 5, each two told apart by the vector product."""
+    found = detect(np.full((CAMERA.height, CAMERA.width), 90, np.uint8))
+    assert (len(found.centres), found.faces, found.notes) == (0, (), ())
+    names = PublishedPattern(reference_target()).names
+    assert names == {(0, 0): "1", (1, -1): "2", (1, 1): "4", (-1, 1): "3", (-1, -1): "5"}
+    face = TARGET.face("1")
+    xy = face.xy_mm.copy()
+    xy[face.ids.index("6")] = (50.0, 30.0)
+    other = TargetDesign("other", "bright", (replace(face, xy_mm=xy), TARGET.face("2")))
+    refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern, other)
+
+
+@pytest.fixture(scope="module")
+def dots(sample):
+    grey = decode((sample / "images/12/IMG_1000.jpg").read_bytes(), "sample")
+    camera = read_camera(sample / "cameras.txt").calibrated(grey.shape[1], grey.shape[0])
+    return Candidates(find_ellipses(grey, "bright", EllipseOptions()), camera), image_corners(camera)
+
+
+def test_another_pitch_than_stated_is_named_with_the_true_ratio_and_a_grid_of_other_dots_is_not_the_board(dots):
+    """Of the sample, 30 mm with radii of 7.5 mm; blur makes dots a little larger."""
+    for factor in (0.52, 1.5, 3.0):
+        board = replace(reference_board(), pitch_mm=30.0 * factor, corner=None)
+        note = contradiction(dots[0], board, dots[1], find_boards(dots[0], board, dots[1]))
+        assert float(note.partition("its pitch ")[2].partition(" times")[0]) == pytest.approx(4.0, rel=0.03)
+    board = replace(reference_board(), rows=12, columns=14, pitch_mm=60.0, corner=None)
+    tiny = replace(board, pitch_mm=0.5, radius_mm=0.1, unusual_size=True)  # as its file says
+    small = replace(board, pitch_mm=1.0, radius_mm=0.06)  # smaller radii are tried than a file may state
+    for other in (board, replace(reference_board(), corner=None), tiny, small):
+        assert contradiction(dots[0], other, dots[1], []) == ""

@@ -130,37 +130,28 @@ def test_what_cannot_be_made_is_refused(options, said):
     refuses(said, lambda: make_target(DesignOptions(SIZE, **options)))
 
 
-def test_some_sides_alone_have_circles():
+def test_some_sides_alone_have_circles_and_sizes_are_three_lengths():
     assert faces_of("") == NAMES
     names = faces_of("top, front")
     assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
     every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
     for side in sides_of(SIZE, names):
         np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
+    for size in ("130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"):
+        with pytest.raises(InputError, match="--size"):
+            DesignOptions(size_of(size))
 
 
-@pytest.mark.parametrize("size", ["130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"])
-def test_sizes_are_three_lengths(size):
-    with pytest.raises(InputError, match="--size"):
-        DesignOptions(size_of(size))
-
-
-@pytest.mark.parametrize(
-    ("outline", "said"),
-    [
+def test_outlines_at_any_angle_are_taken_and_those_that_do_not_fit_refused(tmp_path):
+    for outline, said in (
         ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "E-TARGET-OUTLINE … outline_mm"),
         ("[[-50, -50], [-50, -50], [190, 190]]", "E-TARGET-OUTLINE"),
         ("[[-50, -50], [190, 190]]", "E-KEY-VALUE … outline_mm"),
         ("[[300, -50], [400, -40], [390, 190], [290, 180]]", "E-TARGET-OUTLINE … outline_mm"),  # beside all circles
-    ],
-)
-def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
-    text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
-    (tmp_path / "target.toml").write_text(text)
-    refuses(said, load_target, tmp_path / "target.toml")
-
-
-def test_outlines_at_any_angle_are_taken(tmp_path):
+    ):
+        text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
+        (tmp_path / "target.toml").write_text(text)
+        refuses(said, load_target, tmp_path / "target.toml")
     design = second_design()[0]
     middle, reach = design.faces[0].xy_mm.mean(0), np.ptp(design.faces[0].xy_mm, axis=0).max()
     angles = np.radians(50) + np.pi * np.array([0.1, 0.8, 1.2, 1.7])  # no two sides are parallel

@@ -32,16 +32,23 @@ def true_angle(scene, a, b):
     return np.degrees(np.median(np.arccos(cosine)))
 
 
-def test_angles_are_those_of_the_scene(scene, group):
+def test_angles_are_those_of_the_scene_and_triangulation_returns_the_points(scene, group):
     by_name = {o.name: o for o in group}
     for pair in rank_pairs(group, scene.camera, PairOptions(np.radians(170))):
         # The eccentricity of up to 0.1 px is the only error here.
         expected = true_angle(scene, by_name[pair.first], by_name[pair.second])
         assert np.degrees(pair.median_angle_rad) == pytest.approx(expected, abs=0.5)
         assert pair.in_front == 1.0
+    for depth in (1.5, -1.5):
+        xyz = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) + np.array([0, 0, depth])
+        b_from_a = Rigid.exp([0.1, -0.3, 0.05, 0.8, 0.1, 0.2])
+        in_b = b_from_a @ xyz
+        found, front = triangulate(xyz[:, :2] / xyz[:, 2:], in_b[:, :2] / in_b[:, 2:], b_from_a)
+        np.testing.assert_allclose(found, xyz, atol=1e-12)
+        assert (front == (depth > 0)).all()
 
 
-def test_the_largest_angle_under_the_limit_wins_and_the_rest_is_ranked(scene, group):
+def test_the_largest_angle_under_the_limit_wins_or_the_smallest_where_all_are_beyond(scene, group, monkeypatch):
     everything = rank_pairs(group, scene.camera, PairOptions(np.radians(170)))
     assert len(everything) == 10
     angles = [p.median_angle_rad for p in everything]
@@ -52,6 +59,11 @@ def test_the_largest_angle_under_the_limit_wins_and_the_rest_is_ranked(scene, gr
     assert limited[0].verdict == "chosen"
     assert limited[0].median_angle_rad == pytest.approx(angles[3])
     assert sum("over the limit" in p.verdict for p in limited) == 3
+    monkeypatch.setattr("stcal.sfm.mapping.pairs.SAFE_ANGLE_RAD", np.radians(2.0))
+    ranked = rank_pairs(group, scene.camera, PairOptions())
+    assert ranked[0].median_angle_rad == min(p.median_angle_rad for p in ranked)
+    assert ranked[0].verdict.startswith("chosen")
+    assert len(ranked) == 10
 
 
 def test_groups_without_an_initial_pair_say_why(scene, group):
@@ -70,24 +82,6 @@ def test_groups_without_an_initial_pair_say_why(scene, group):
         (group[:2], PairOptions(np.radians(1.5)), "E-MAPPING-NO-PAIR … --max-angle"),
     ):
         refuses(error, rank_pairs, images, scene.camera, options)
-
-
-def test_the_smallest_angle_serves_where_all_are_beyond_the_default(scene, group, monkeypatch):
-    monkeypatch.setattr("stcal.sfm.mapping.pairs.SAFE_ANGLE_RAD", np.radians(2.0))
-    ranked = rank_pairs(group, scene.camera, PairOptions())
-    assert ranked[0].median_angle_rad == min(p.median_angle_rad for p in ranked)
-    assert ranked[0].verdict.startswith("chosen")
-    assert len(ranked) == 10
-
-
-@pytest.mark.parametrize("depth", [1.5, -1.5])
-def test_triangulation_returns_the_points(depth):
-    xyz = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) + np.array([0, 0, depth])
-    b_from_a = Rigid.exp([0.1, -0.3, 0.05, 0.8, 0.1, 0.2])
-    in_b = b_from_a @ xyz
-    found, front = triangulate(xyz[:, :2] / xyz[:, 2:], in_b[:, :2] / in_b[:, 2:], b_from_a)
-    np.testing.assert_allclose(found, xyz, atol=1e-12)
-    assert (front == (depth > 0)).all()
 
 
 @pytest.fixture(scope="module")

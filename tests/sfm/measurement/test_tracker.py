@@ -84,7 +84,7 @@ def test_what_jumps_and_what_comes_after_an_image_without_the_target_is_searched
         assert np.linalg.norm(pose.camera_from_target.translation - truth[i].translation) < 1
 
 
-def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
+def test_the_common_shift_is_found_and_a_hidden_face_missed_by_name(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     seen = tracker.locate(frames[0])
     hidden, face = frames[1].copy(), seen.faces[0]
@@ -96,9 +96,6 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     assert face not in left_over.faces
     assert not tracker.searched  # the other face has half of the circles, as many as are asked for
     assert any(note.startswith(f"face {face}: {face}:1 and 9 more should be in view") for note in tracker.notes)
-
-
-def test_the_common_shift_is_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     pose = tracker.locate(frames[0])
     predicted = tracker._predicted(pose.camera_from_target, tracker.camera, (), np.radians(70))
@@ -109,15 +106,10 @@ def test_the_common_shift_is_found(film, frames, target, model):
     assert not common_shift(np.zeros_like(frames[0]), predicted).any()
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)]
-)
-def test_what_is_no_image_of_the_camera_is_refused(target, model, image):
-    with pytest.raises(InputError, match=r"^image: "):
-        Tracker(target, model[1]).locate(image)
-
-
-def test_a_target_without_design_is_refused(target, model):
+def test_what_is_no_image_of_the_camera_and_a_target_without_design_are_refused(target, model):
+    for image in (np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)):
+        with pytest.raises(InputError, match=r"^image: "):
+            Tracker(target, model[1]).locate(image)
     bare = TargetCircles(target.labels, target.xyz, target.radius, target.covariance)
     with fails_with("E-FACES-DESIGN"):
         Tracker(bare, model[1])

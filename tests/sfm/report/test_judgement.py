@@ -101,15 +101,12 @@ def test_a_suspicious_check_says_how_often_chance_makes_one():
     assert judgement_of(report(left_out, *others)).use == "With care: 1 of 17 checks is suspicious, the first: Check a."
 
 
-def test_the_face_that_stands_out_limits():
+def test_the_face_that_stands_out_limits_else_the_largest_share():
+    """Along z the board has more than the photographs of face 3; of x, y and z together it has less."""
     found = judgement_of(report(f4=[6.0, 3.0, 2.0]))
     assert found.limit == "Face 4: 6.0 µm along x, where the others have 2.0 µm; 2 images show it, of group a."
     assert "images that show face 4" in found.next
     assert judgement_of(report(f4=[3.9, 2.0, 2.0])).limit.startswith("The centring")  # less than twice 2.0 µm
-
-
-def test_the_largest_share_limits_of_the_face_and_axis_that_quality_names():
-    """Along z the board has more than the photographs of face 3; of x, y and z together it has less."""
     own = report(share=0.51, f3=[2.5, 2.5, 3.5])
     for kind, factor in (("board", 0.1), ("circles", 1.4), ("dots", 1.4)):
         sources = own["faces"]["3"]["translation_sources_um"]
@@ -190,15 +187,12 @@ def test_what_is_missing_is_said_too():
     assert told.next.endswith("For 2 more checks: add a group.")
 
 
-def test_checks_that_nobody_can_make_possible_are_not_missed():
-    """A body of tags has no circles and no board: what tests these is not applicable."""
+def test_what_nobody_can_make_possible_is_not_missed_but_photographs_that_do_not_test_one_another():
+    """A body of tags has no circles and no board: what tests these is not applicable. Two of five checks passed, but
+    none that residuals decide."""
     own = report(check("labels", "passed"), check("rim", "not possible"), check("halves", "not possible", remedy="add"))
     assert judgement_of(own).use == "Yes: 1 checks passed, 1 was not possible."
     assert count_verdicts(map(Check.read, own["checks"])) == "1 passed, 1 not possible, 1 not applicable"
-
-
-def test_photographs_that_do_not_test_one_another_are_no_yes():
-    """Two of five checks passed, but none that residuals decide."""
     keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
     missed = [check(key, verdict, remedy="add images") for key, verdict in keys.items()]
     own = report(check("pitch", "passed"), check("radius", "passed"), *missed)
@@ -209,7 +203,7 @@ def test_photographs_that_do_not_test_one_another_are_no_yes():
     assert judgement_of(report(*(check(k, v) for k, v in keys.items()))).verdict == "yes"
 
 
-def test_a_missing_face_that_was_expected_is_named():
+def test_a_face_that_was_expected_or_read_and_left_out_is_missing():
     own = report()
     own["summary"] |= {"faces_not_seen": ["5", "6"], "faces_expected": ["1", "6"]}
     told = judgement_of(own)
@@ -218,9 +212,6 @@ def test_a_missing_face_that_was_expected_is_named():
     assert "Face 6 should have been photographed" in told.limit
     own["checks"] = [check("a", "failed", remedy="x")]
     assert re.search("the first: Check a; .* faces 5, 6 ", judgement_of(own).use)
-
-
-def test_a_face_that_was_read_and_left_out_is_missing():
     own = report()
     own["summary"]["faces_not_seen"] = ["5"]
     own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "code": ELSEWHERE, "place": "5"} for i in range(3)]

@@ -210,7 +210,8 @@ def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     assert report_html(copy.deepcopy(make()), OVERLAYS) == joint
 
 
-def test_numbers_have_their_digits(joint):
+def test_numbers_have_their_digits_and_what_was_not_computed_is_a_dash(joint, chained):
+    """A control without eccentricity raises an alarm."""
     faces = rows_of(joint, "faces")
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6] in faces
     pose, sigma = ["150.0000", "0.0000", "-60.1235"], ["1.0", "2.1", "3.1", "0.50", "0.61", "0.72"]
@@ -222,9 +223,6 @@ def test_numbers_have_their_digits(joint):
     scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "2.0", "3.6", "5.0"]
     assert scale in rows_of(joint, "scale")
     assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
-
-
-def test_what_was_not_computed_is_a_dash_and_a_control_without_eccentricity_raises_an_alarm(joint, chained):
     assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
     face_row = next(row for row in rows_of(chained, "faces") if row[0] == "2")
     assert face_row[4:] == ["–"] * 6
@@ -275,16 +273,13 @@ def test_residuals_over_their_sigma_are_of_a_normal_distribution(small_result, m
     assert f"{values.size} coordinates, " in " ".join(words(normalised_residuals(values.ravel())))
 
 
-def test_mean_residuals_stand_in_their_cells_with_their_number():
+def test_figures_of_residuals_name_cells_photographs_and_limits():
     """Twenty in one cell and four, too few to be drawn, in another."""
     one = np.tile([110.0, 70.0, 0.02, 0.0], (20, 1))
     seen = words(residual_field(np.vstack([one, np.tile([1000.0, 70.0, 5.0, 0.0], (4, 1))]), (1200, 800)))
     assert "20" in seen
     assert "4" not in seen
     assert any(text.startswith("0.02 px") for text in seen)
-
-
-def test_the_worst_photograph_is_named_and_halves_have_their_limits():
     rows = [{"image": f"{i}.jpg", "rms_px": rms} for i, rms in enumerate((0.01, 0.05, 0.02))]
     assert [text for text in words(by_photograph(rows)) if text.endswith(".jpg")] == ["1.jpg"]
     faces = [{"name": f"face {i}", "value": 3.0 * i, "limit": 10.0, "unit": "µm"} for i in (4, 2)]

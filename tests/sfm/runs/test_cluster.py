@@ -123,20 +123,17 @@ def killing(process):
 
 
 @pytest.mark.parametrize("send", sampled([False, True]))
-def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same(small_set, tmp_path, send):
+def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same_and_without_its_scheduler_ends_in_one_line(
+    small_set, tmp_path, send
+):
     small = small_set("12")
     expected = run_into(small.out, small)
-    with two_workers(tmp_path) as (address, _, workers):
+    with two_workers(tmp_path) as (address, scheduler, workers):
         progress, killed = killing(workers[0])
         with cluster.dask_cluster(address, send):
             assert run_into(tmp_path / "run", small, progress=progress) == expected
         assert killed
-
-
-@pytest.mark.slow
-def test_a_run_by_a_cluster_that_loses_its_scheduler_ends_in_one_line(small_set, tmp_path):
-    with two_workers(tmp_path) as (address, scheduler, _):
         progress, killed = killing(scheduler)
         with fails_with(f"E-WORKER-DIED … {address}"), cluster.dask_cluster(address):
-            run_into(tmp_path / "run", small_set("12"), progress=progress)
+            run_into(tmp_path / "other", small, progress=progress)
         assert killed

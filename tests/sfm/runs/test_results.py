@@ -35,17 +35,14 @@ from tests.outcome import fails_with
 from tests.shared import own_copy
 
 
-def test_a_result_shows_itself_in_a_line_and_in_a_notebook(small_result):
+def test_a_result_shows_itself_and_every_promised_file_is_there(small_result, small_run):
+    """Faces and labels are read back in `runs/test_saved_run.py`; intrinsics that are held make no file."""
     text, page = repr(small_result), small_result._repr_html_()
     assert len(text) < 500
     assert "\n" not in text
     assert small_result.judgement.use.removesuffix(".") in text
     assert small_result.judgement.use in page
     assert re.findall(r'<th scope="row" class="l">(\d)', page) == list(small_result.target.target_from_face)
-
-
-def test_every_promised_file_is_there(small_run):
-    """Faces and labels are read back in `runs/test_saved_run.py`."""
     out = small_run
     np.testing.assert_allclose(json.loads((out / "faces.json").read_text())["circles"]["1:1"], 0, atol=0.01)
     report = json.loads((out / "report.json").read_text())
@@ -55,6 +52,8 @@ def test_every_promised_file_is_there(small_run):
     assert {p.name for p in (out / "colmap/models").iterdir()} == {"12", "14"}
     assert not list(out.rglob("*.partial"))
     assert not (out / "scratch").exists()
+    assert (small_run / CAMERA).is_file()
+    assert not (small_run / REFINED_CAMERA).exists()
 
 
 def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_path):
@@ -123,11 +122,6 @@ def test_a_run_that_fails_leaves_no_file_either(scratch):
 pytestmark = pytest.mark.usefixtures("no_page")
 CHI2_8_999 = 26.1
 """Of the squares of eight parameters' errors over their σ, once in a thousand draws more."""
-
-
-def test_held_intrinsics_make_no_file(small_run):
-    assert (small_run / CAMERA).is_file()
-    assert not (small_run / REFINED_CAMERA).exists()
 
 
 @pytest.mark.parametrize("given", sampled(["as of EXIF, 4 % off", "nothing"]))
