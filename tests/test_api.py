@@ -395,23 +395,17 @@ class Result:
     checks = (check("camera"),)
 
 
-def test_checks_of_ones_own_have_their_own_names():
+def test_checks_of_ones_own_have_their_own_names_and_lose_no_result():
     assert [each.verdict for each in own_checks(Result(), [lambda _: check("mine")])] == ["failed"]  # 5 σ
-
-
-@pytest.mark.parametrize(
-    ("make", "fault"),
-    [
+    for make, said in (
         (lambda _: check("camera"), "it has the key 'camera' of another"),
         (lambda _: True, "it returned bool, a Check needed"),
         (lambda _: [][1], "it raised IndexError: list index out of range"),
-    ],
-)
-def test_a_check_that_cannot_be_made_loses_no_result(make, fault):
-    first, second = own_checks(Result(), [make, make])
-    assert (first.verdict, second.verdict) == ("suspicious", "suspicious")
-    assert first.reason.startswith(fault)
-    assert first.key != second.key
+    ):
+        first, second = own_checks(Result(), [make, make])
+        assert (first.verdict, second.verdict) == ("suspicious", "suspicious")
+        assert first.reason.startswith(said)
+        assert first.key != second.key
 
 
 def test_the_repr_of_a_large_result_is_a_line():

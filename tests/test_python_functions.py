@@ -74,9 +74,11 @@ def calls_it(command: Callable, function: object) -> bool:
     return id(function) in used(inspect.unwrap(command).__module__)
 
 
-def test_every_command_is_in_the_table():
+def test_every_command_is_in_the_table_and_what_is_not_called_is_found():
     assert set(TABLE) == set(COMMANDS)
     assert {command for command, cell in TABLE.items() if cell.startswith("none: ")} == APART
+    assert not calls_it(COMMANDS["sfm run"], stcal.sfm.plan)
+    assert calls_it(COMMANDS["robot design"], robot.design)  # by its module
 
 
 @pytest.mark.parametrize("command", sorted(set(COMMANDS) - APART))
@@ -88,11 +90,6 @@ def test_a_command_calls_public_functions(command):
 
 INSIDE = {"sfm.detect_circles", "handeye.handeye", "robot.load_universal", "workflows.read_handeye"}
 """Beside what the command calls: the same for one image, for arrays, with an error for other files, and at once."""
-
-
-def test_what_is_not_called_is_found():
-    assert not calls_it(COMMANDS["sfm run"], stcal.sfm.plan)
-    assert calls_it(COMMANDS["robot design"], robot.design)  # by its module
 
 
 def call(*words) -> str:

@@ -304,8 +304,9 @@ def test_every_command_has_a_call_that_goes_through_and_every_option_that_writes
     assert len(PAIRS) > 60
 
 
-def test_no_output_replaces_an_input(tmp_path):
-    """The file itself, by another way to it, and a file in a folder that is read."""
+def test_no_output_replaces_an_input_or_a_file_in_silence(tmp_path):
+    """The file itself, by another way to it, and a file in a folder that is read. One rule for every file that any
+    command writes, before its work; links, to nothing too, are files."""
     own = tmp_path / "given"
     own.write_text("mine")
     another_way = tmp_path / "." / "x" / ".." / "given"
@@ -314,10 +315,6 @@ def test_no_output_replaces_an_input(tmp_path):
         for paths in ({read: own, output: own}, {read: own, output: another_way}, {read: tmp_path, output: own}):
             refuses("E-OUTPUT-IS-INPUT … given", command, **given | paths)
     assert own.read_text() == "mine"
-
-
-def test_no_output_replaces_a_file_in_silence(tmp_path):
-    """One rule for every file that any command writes, before its work; links, to nothing too, are files."""
     place, link = tmp_path / "earlier", tmp_path / "link"
     place.write_text("a better one")
     link.symlink_to(tmp_path / "nothing")

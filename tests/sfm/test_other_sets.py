@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal import BoardDesign, Camera, reference_target
+from stcal import BoardDesign, Camera, load_target, reference_target
 from stcal.boards.board_designs import AsymmetricCirclesDesign, HexagonalCirclesDesign, LatticePart
 from stcal.boards.board_file import board_toml, load_board
-from stcal.boards.target_file import load_target
 from stcal.io.cameras.read import read_camera
 from stcal.labels import DotLabel
 from stcal.sfm import RunOptions, calibrate_camera, compare, crosscheck, load_run, run

@@ -51,17 +51,14 @@ def test_where_python_forgets_exceptions_a_signal_is_sent_again(number, said, co
     assert (done.returncode, done.stderr.splitlines()) == (code, [said])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_after_the_answer_changes_no_exit_code(number):
+def test_signals_after_the_answer_change_no_exit_code_and_colmaps_bindings_leave_them_as_they_were():
     """While Python ends itself; the results are in place."""
-    begin = f"import atexit, os; atexit.register(os.kill, os.getpid(), {int(number)}); {SFM[-1]}"
-    found = subprocess.run(
-        [sys.executable, "-P", "-c", begin, "--version"], capture_output=True, text=True, check=False
-    )
-    assert (found.returncode, found.stderr) == (0, "")
-
-
-def test_colmaps_bindings_leave_the_signals_as_they_were():
+    for number in (signal.SIGTERM, signal.SIGINT):
+        begin = f"import atexit, os; atexit.register(os.kill, os.getpid(), {int(number)}); {SFM[-1]}"
+        found = subprocess.run(
+            [sys.executable, "-P", "-c", begin, "--version"], capture_output=True, text=True, check=False
+        )
+        assert (found.returncode, found.stderr) == (0, "")
     begin = (
         "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(7));"
         "import stcal.sfm.mapping.database; print('on', flush=True); signal.pause()"

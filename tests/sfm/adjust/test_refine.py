@@ -142,7 +142,7 @@ def test_squares_of_observations_are_chi_square(network, full):
     assert 0.8 < beyond / (1e-3 * count) < 1.25
 
 
-def test_weights_are_hubers_and_the_cost_is_theirs(group):
+def test_weights_are_hubers_and_costs_are_theirs_and_those_of_dots_off_their_design(group):
     """Weight 1 within the limit and limit/length beyond; the cost's derivative by a residual is 2 w r."""
     model, camera = group
     far = model.measured_px.copy()
@@ -163,9 +163,6 @@ def test_weights_are_hubers_and_the_cost_is_theirs(group):
     turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
     assert equations.image_cost(replace(model, camera_from_model=turned), camera, 4.0) == np.inf  # behind them
     assert gradient == pytest.approx(2 * weights[5] * by_x @ equations.normalised(model, camera)[5], rel=1e-5)
-
-
-def test_dots_off_their_design_cost_their_squares_over_sigma(group):
     model, camera = group
     (dot_rows,) = np.nonzero([isinstance(label, DotLabel) for label in model.labels])
     (circle_rows,) = np.nonzero([isinstance(label, CircleLabel) for label in model.labels])

@@ -127,7 +127,7 @@ def test_the_model_of_the_lens_is_chosen(truth, wanted):
 
 
 @pytest.mark.slow
-def test_a_model_that_fails_says_why(monkeypatch):
+def test_a_model_that_fails_and_too_few_views_and_a_row_too_many_are_said(monkeypatch, result):
     monkeypatch.setattr(calibration, "CANDIDATES", ("PINHOLE", "OPENCV"))
     views = views_of(np.random.default_rng(6), count=8)
     own = calibration.adjust_intrinsics
@@ -141,10 +141,6 @@ def test_a_model_that_fails_says_why(monkeypatch):
     chosen, rows = calibration.choose_model(views, BOARD, known_of(views, TRUE), 1)
     assert chosen == "OPENCV"
     assert (rows[0].why, rows[0].rms_px) == ("no minimum", None)
-
-
-@pytest.mark.slow
-def test_of_too_few_views_none_is_held_out_and_no_model_chosen_and_a_row_too_many_is_said(monkeypatch, result):
     longer = replace(BOARD, rows=BOARD.rows + 1)
     warnings = judged(result.intrinsics, result.views, (), 1, True, longer).warnings
     assert any(f"board row {BOARD.rows}: not seen in any image" in warning for warning in warnings)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal import BoardDesign, Rigid
-from stcal.design import reference_board, reference_target
+from stcal import BoardDesign, Rigid, reference_board, reference_target
 from stcal.errors import DetectionError
 from stcal.io.images import ImageFile
 from stcal.sfm.detect.candidates import BoardSighting, EllipseOptions

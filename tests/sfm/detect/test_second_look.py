@@ -121,7 +121,7 @@ class Sheet:
         return measure_predicted(pixels, camera, circles, options or EllipseOptions())
 
 
-def test_circles_are_measured_in_their_place():
+def test_circles_that_are_wanted_are_measured_in_their_place_where_their_polarity_is():
     """Predicted up to a pixel beside it, as a design may be off. Squares over variances, the mean of χ²(12)/12."""
     circles = Sheet()
     look = circles.look(centre_px=circles.centre + np.random.default_rng(1).uniform(-0.7, 0.7, (6, 2)))
@@ -130,9 +130,6 @@ def test_circles_are_measured_in_their_place():
     normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(look.centres.covariance_px2), error) / 2
     assert 0.15 < normalised.mean() < 2.8  # each once in a thousand
     assert 1e-3 < np.linalg.norm(error, axis=1).max() < 0.05
-
-
-def test_only_what_is_wanted_is_measured_where_its_polarity_is():
     circles, wanted = Sheet(), np.arange(6) % 2 == 0
     assert circles.look(wanted=wanted).labels == ("1:1", "1:3", "1:5")
     circles.share = 1 - circles.share

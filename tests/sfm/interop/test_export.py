@@ -89,7 +89,7 @@ def test_ros(files, faces, form, read):
     require_frames(read(files[form].read_text(encoding="utf-8")), faces)
 
 
-def test_opencv(files, faces):
+def test_opencv_and_table(files, faces):
     storage = cv2.FileStorage(str(files["opencv"]), cv2.FILE_STORAGE_READ)
     found = storage.getNode("faces")
     assert found.size() == len(faces["target_from_face"])
@@ -103,9 +103,6 @@ def test_opencv(files, faces):
         assert own.getNode("radii").mat().ravel().tolist() == [faces["radius_mm"][label] for label in labels]
         covariances = own.getNode("centres_covariance").mat().reshape(-1, 3, 3)
         assert covariances.tolist() == [faces["circle_covariance_mm2"][label] for label in labels]
-
-
-def test_table(files, faces):
     with open(files["csv"], encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:

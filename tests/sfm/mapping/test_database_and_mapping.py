@@ -8,8 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.errors import InputError
-from stcal.geometry.rigid import Rigid
+from stcal import InputError, Rigid
 from stcal.sfm.mapping.database import from_colmap_px, image_ids, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.pairs import PairOptions, image_graph, rank_pairs, triangulate
@@ -121,11 +120,10 @@ def test_a_database_that_finds_no_space_is_one_error_and_nothing_is_left(scene, 
     assert len(ends) > 3
 
 
-def test_a_database_holds_one_camera_a_frame_for_each_image_and_the_keypoints_half_a_pixel_on(
-    scene, database, observed
-):
+def test_a_database_holds_one_camera_frames_keypoints_half_a_pixel_on_and_matches_of_labels(scene, database, observed):
     """COLMAP puts the centre of the first pixel at (0.5, 0.5); float32 leaves half a step of 2.4e-4 px near 2592. It
-    projects where our camera does. Pairs are calibrated: it passes over others."""
+    projects where our camera does. Pairs are calibrated: it passes over others. Board dots match in a group only,
+    target circles everywhere."""
     assert sorted(p.name for p in database.parent.iterdir()) == ["database.db"]
     with pycolmap.Database.open(str(database)) as opened:
         camera = opened.read_camera(1)
@@ -146,9 +144,6 @@ def test_a_database_holds_one_camera_a_frame_for_each_image_and_the_keypoints_ha
     xyz = np.array([[0.1, -0.2, 1.0], [-0.3, 0.2, 1.1]])
     theirs = np.array([camera.img_from_cam(point) for point in xyz])
     assert np.abs(theirs - 0.5 - scene.camera.project(xyz)).max() < 1e-9
-
-
-def test_board_dots_match_in_a_group_only_and_target_circles_everywhere(observed):
     a = observed[0]
     same = next(o for o in observed[1:] if o.group == a.group)
     other = next(o for o in observed if o.group != a.group and set(o.face_ids()) & set(a.face_ids()))

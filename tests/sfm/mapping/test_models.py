@@ -214,7 +214,7 @@ def test_points_of_all_groups_and_boards_of_two_groups_merged(saved, tmp_path):
     assert all("board:3:4" not in group.labels and "board:3:5" in group.labels for group in found.groups)
 
 
-def test_a_group_in_two_models(saved, model, plain, tmp_path):
+def test_a_group_in_two_models_and_models_with_different_cameras(saved, model, plain, tmp_path):
     """As the mapper writes them: 0, 1, …; the larger one counts."""
     gone = next(iter(model.images.values())).frame_id
     model.deregister_frame(gone)
@@ -226,9 +226,6 @@ def test_a_group_in_two_models(saved, model, plain, tmp_path):
     assert_same_faces(found, plain)
     assert len(found.models[0].images) == 4
     assert found.notes == ("group 12: in several models; the one with the most images was taken", NOT_THERE)
-
-
-def test_models_with_different_cameras(saved, model, tmp_path):
     own_copy(saved.folder / "colmap/models" / "14", tmp_path / "both" / "1")
     model.cameras[1].params = model.cameras[1].params * (1 + 1e-9)
     model.folder = tmp_path / "both" / "0"

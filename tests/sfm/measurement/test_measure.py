@@ -97,6 +97,8 @@ def test_no_flipped_pose_is_certain(scene, known, count, tilt_deg, distance_mm, 
 
 
 def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
+    """Images are resolved in order of their names. Certain, ambiguous, ambiguous: the second by the first, the third by
+    the second; not without asking."""
     rng = np.random.default_rng(4)
     truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
     alone, both = (see(scene, truth, faces, 0.5, np.random.default_rng(0)) for faces in (("1",), ("1", "2", "4")))
@@ -115,12 +117,7 @@ def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
     assert resolved(pose, other.camera_from_target).camera_from_target is other.camera_from_target
     far = Rigid(Rigid.exp([0, 1.5, 0, 0, 0, 0]).rotation @ truth.rotation, truth.translation)
     assert resolved(pose, far).status == "ambiguous"
-
-
-def test_images_are_resolved_in_order_of_their_names(scene, known):
-    """Certain, ambiguous, ambiguous: the second by the first, the third by the second; not without asking."""
     rng = np.random.default_rng(4)
-    truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
     images = [
         replace(see(scene, truth, ("1", "2", "4") if i == 0 else ("1",), 0.5, rng), name=f"a/{i}", group="a")
         for i in range(3)
@@ -349,7 +346,7 @@ def test_other_joints_are_refused(scene, known, tmp_path, text, code):
         poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
 
 
-def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
+def test_faces_that_are_not_calibrated_and_mistakes_in_the_camera_file_are_said(scene, known):
     rng, truth = np.random.default_rng(0), known.truth
     image = see(scene, view(face_view(scene, "2"), 0.3, 900, rng), ("2",), 0.02, rng)
     keep = [i for i, label in enumerate(truth.labels) if label.face != "2"]
@@ -359,27 +356,23 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     assert result.images == ()
     assert result.left_out[0].reason == "face 2 is not calibrated"
     assert measured_from([image.select([])], scene.camera, truth).left_out[0].reason == NO_FACE
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
+    for change, said in (
         (lambda camera: replace(camera, focal=camera.focal / 2, centre=(camera.centre + 0.5) / 2 - 0.5), "half"),
         (lambda camera: replace(camera, centre=camera.centre + 150), "cut out"),
         (lambda camera: replace(camera, focal=1.1 * camera.focal), None),
-    ],
-)
-def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
-    rng = np.random.default_rng(2)
-    images = [
-        replace(see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name)
-        for name in "abc"
-    ]
-    true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
-    shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
-    assert measured_from(shifted, true, known.truth).mistakes == ()
-    found = measured_from(shifted, change(true), known.truth).mistakes
-    assert found == () if said is None else said in found[0].replace("0.5 times", "half")
+    ):
+        rng = np.random.default_rng(2)
+        images = [
+            replace(
+                see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name
+            )
+            for name in "abc"
+        ]
+        true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
+        shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
+        assert measured_from(shifted, true, known.truth).mistakes == ()
+        found = measured_from(shifted, change(true), known.truth).mistakes
+        assert found == () if said is None else said in found[0].replace("0.5 times", "half")
 
 
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):

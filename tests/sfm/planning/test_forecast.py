@@ -352,13 +352,26 @@ def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigm
     assert max(times) == pytest.approx(1, rel=2e-3)
 
 
-def test_plan_remedies_are_plans_of_their_own():
-    """Of faces 1, 2 and 3, the last two groups away from the first."""
+def test_plan_remedies_are_plans_of_their_own_and_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
+    """Of faces 1, 2 and 3, the last two groups away from the first. σ of all faces as by every dot, to 5 %: photographs
+    and board are the same, and the edges weigh more."""
     options = PlanOptions(width=2592, images=2, groups=(("1", "2"), ("2", "3")), noise=NOISE)
     designs = reference_target(), reference_board(), reference_target().rough_poses()
     two, four = (plan(replace(options, images=images), *designs) for images in (2, 4))
     assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
+    board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
+    board = replace(board, corner_radius_mm=None)
+    options, target = PlanOptions(images=2, groups=(("1", "2"), ("1", "4"))), reference_target()
+    found = []
+    for most in (session.MOST_DOTS, 1000):
+        monkeypatch.setattr(session, "MOST_DOTS", most)
+        _, models, setup = session._beside_board(options, target, board, target.rough_poses())
+        found.append((setup, forecast(models, setup).position_sigma_mm(), sum(setup.centres(m).sum() for m in models)))
+    (some, sigma, observations), (every, expected, all_observations) = found
+    np.testing.assert_allclose([sigma[face] for face in expected], list(expected.values()), rtol=0.05)
+    assert observations == pytest.approx(all_observations, rel=0.05)
+    assert some.stands_for > every.stands_for == 1
 
 
 @pytest.mark.parametrize(
@@ -410,19 +423,3 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     scaled = [each.camera_covariance / np.outer(unit, unit) for each in found]
     np.testing.assert_allclose(*scaled, rtol=0, atol=1e-6)
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
-
-
-def test_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
-    """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
-    board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
-    board = replace(board, corner_radius_mm=None)
-    options, target = PlanOptions(images=2, groups=(("1", "2"), ("1", "4"))), reference_target()
-    found = []
-    for most in (session.MOST_DOTS, 1000):
-        monkeypatch.setattr(session, "MOST_DOTS", most)
-        _, models, setup = session._beside_board(options, target, board, target.rough_poses())
-        found.append((setup, forecast(models, setup).position_sigma_mm(), sum(setup.centres(m).sum() for m in models)))
-    (some, sigma, observations), (every, expected, all_observations) = found
-    np.testing.assert_allclose([sigma[face] for face in expected], list(expected.values()), rtol=0.05)
-    assert observations == pytest.approx(all_observations, rel=0.05)
-    assert some.stands_for > every.stands_for == 1

@@ -39,17 +39,25 @@ def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil,
         assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.05, 3.0])
-def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, factor):
-    content = json.loads((small_run / "faces.json").read_text())
-    content["circles"] = {label: [factor * v for v in xyz] for label, xyz in content["circles"].items()}
-    for matrix in content["target_from_face"].values():
-        for row in matrix[:3]:
-            row[3] *= factor
-    other = tmp_path / "faces.json"
-    other.write_text(json.dumps(content))
-    worst = compare(other, small_dataset / "truth.json").worst.translation_um
-    assert (worst > 1000) == (factor != 1.0)
+def test_a_run_of_another_size_is_compared_and_a_place_beyond_all_reach_named(small_run, small_dataset, tmp_path):
+    """Its square overflows, which ended the fit in NumPy's error."""
+    for factor in (1.0, 1.05, 3.0):
+        content = json.loads((small_run / "faces.json").read_text())
+        content["circles"] = {label: [factor * v for v in xyz] for label, xyz in content["circles"].items()}
+        for matrix in content["target_from_face"].values():
+            for row in matrix[:3]:
+                row[3] *= factor
+        other = tmp_path / "faces.json"
+        other.write_text(json.dumps(content))
+        worst = compare(other, small_dataset / "truth.json").worst.translation_um
+        assert (worst > 1000) == (factor != 1.0)
+    content = json.loads((small_dataset / "truth.json").read_text())
+    label = next(iter(content["circles"]))
+    content["circles"][label][0] = 1e300
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(content))
+    with fails_with(f"E-VALUE-TOO-FAR … truth.json: circles.{label}"):
+        compare(small_run, path)
 
 
 def test_labels_are_counted_rightly_and_it_is_said_where_they_cannot_be(small_run, small_dataset, tmp_path):
@@ -80,17 +88,6 @@ def test_labels_are_counted_rightly_and_it_is_said_where_they_cannot_be(small_ru
     labels.unlink()
     with pytest.warns(InputNote, match="labels.csv: No such file or directory: the labels are not compared"):
         compare(tmp_path, truth)
-
-
-def test_a_place_beyond_all_reach_is_named(small_run, small_dataset, tmp_path):
-    """Its square overflows, which ended the fit in NumPy's error."""
-    content = json.loads((small_dataset / "truth.json").read_text())
-    label = next(iter(content["circles"]))
-    content["circles"][label][0] = 1e300
-    path = tmp_path / "truth.json"
-    path.write_text(json.dumps(content))
-    with fails_with(f"E-VALUE-TOO-FAR … truth.json: circles.{label}"):
-        compare(small_run, path)
 
 
 def test_measured_poses_are_compared_with_the_truth(small_dataset, tmp_path):

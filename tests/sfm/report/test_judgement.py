@@ -154,7 +154,7 @@ def test_results_that_are_for_comparison_or_not_without_care(own, verdict, part,
     assert words in getattr(found, part)
 
 
-def test_the_board_alone_and_one_face():
+def test_the_board_alone_one_face_and_what_is_missing():
     own = report()
     own["faces"] = {}
     found = judgement_of(own)
@@ -162,9 +162,17 @@ def test_the_board_alone_and_one_face():
     assert "3.6 µm RMS" in found.quality
     own["faces"] = {"1": report()["faces"]["1"]}
     assert "only one face" in judgement_of(own).limit
+    own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
+    own["summary"]["faces_not_seen"] = ["5", "6"]
+    told = judgement_of(own)
+    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; ")
+    assert "faces 5, 6" in told.use
+    assert "4 of the 6 faces" in told.limit
+    assert told.next.startswith("Photograph faces 5, 6")
+    assert told.next.endswith("For 2 more checks: add a group.")
 
 
-def test_sigma_that_are_larger_than_pixels_explain_are_said():
+def test_sigma_that_are_larger_than_pixels_explain_and_premises_are_said():
     own = report(check("groups", "suspicious") | {"enlarges": 1.8})
     own["summary"] |= {"photographs_differ": 1.4, "sigma_enlarged": 1.8}
     told = judgement_of(own)
@@ -174,17 +182,10 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
     own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
     own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
     assert judgement_of(own).use == "With care: focus changed, though no check failed."
-
-
-def test_what_is_missing_is_said_too():
-    own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
-    own["summary"]["faces_not_seen"] = ["5", "6"]
-    told = judgement_of(own)
-    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; ")
-    assert "faces 5, 6" in told.use
-    assert "4 of the 6 faces" in told.limit
-    assert told.next.startswith("Photograph faces 5, 6")
-    assert told.next.endswith("For 2 more checks: add a group.")
+    own = report()
+    assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
+    own["options"]["refine_camera"] = True
+    assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")
 
 
 def test_what_nobody_can_make_possible_is_not_missed_but_photographs_that_do_not_test_one_another():
@@ -248,10 +249,3 @@ def test_after_no_there_are_no_micrometres_but_what_does_not_hold():
     page = report_html(failed, {})
     assert "No σ are shown" in page
     assert "3.04" not in page.replace("-3.04", "")
-
-
-def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
-    own = report()
-    assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
-    own["options"]["refine_camera"] = True
-    assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")

@@ -229,7 +229,8 @@ def test_numbers_have_their_digits_and_what_was_not_computed_is_a_dash(joint, ch
     assert "None" not in Page(chained).text
 
 
-def test_left_out_with_reasons():
+def test_left_out_with_reasons_and_sigma0_as_in_the_certificate(joint):
+    """0.93 makes no σ smaller, 1.3 makes all larger: the factor of ``budget`` is named beside it."""
     report = make()
     report["summary"]["faces_not_seen"] = ["6"]
     report["notes"] = [{"note": "group a: face <6> has no frame", "code": ""}]
@@ -246,10 +247,6 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-
-
-def test_sigma0_is_what_the_certificate_says(joint):
-    """0.93 makes no σ smaller, 1.3 makes all larger: the factor of ``budget`` is named beside it."""
     large = make()
     large["summary"]["sigma0"] = 1.3
     assert "leaves σ₀ = 0.93" in Page(joint).text

@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal import Rigid, reference_board
+from stcal import Camera, Rigid, reference_board
 from stcal.boards.target_file import target_toml
 from stcal.errors import InputError, MappingError
-from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
 from stcal.sfm.detect.labelling import PlaneView, _numbered
 from stcal.sfm.runs.stages import LIKELY, explained, usable_groups, wrong_file

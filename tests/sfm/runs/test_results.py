@@ -27,8 +27,7 @@ from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.pairs import PairOptions, rank_pairs
 from stcal.sfm.runs.conditions import conditions
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
+from stcal.synthetic import RenderOptions, write_dataset
 from tests.conftest import SMALL
 from tests.levels import SLOW, sampled
 from tests.outcome import fails_with

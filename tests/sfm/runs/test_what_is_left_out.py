@@ -79,7 +79,8 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     assert not any(image.reused for image in seen.detection.images)
 
 
-def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
+def test_dropped_observations_take_what_they_alone_hold_and_leave_the_redundancy_of_a_free_network(scene, labels_only):
+    """Residuals with the stated σ give a factor of 1 within the spread of χ² (about 900 degrees of freedom a group)."""
     observed = labels_only.observations(scene, 0.003, np.random.default_rng(0))
     model = labels_only.models(scene, observed)[0]
     rows = np.flatnonzero(model.image_index == 1)
@@ -92,10 +93,6 @@ def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
     kept = smaller.image_index == smaller.images.index(model.images[2])
     before = model.image_index == 2
     np.testing.assert_array_equal(smaller.measured_px[kept], model.measured_px[before])
-
-
-def test_the_redundancy_of_a_free_network(scene, labels_only):
-    """Residuals with the stated σ give a factor of 1 within the spread of χ² (about 900 degrees of freedom a group)."""
     observed = labels_only.observations(scene, 0.005, np.random.default_rng(5))
     models = [refine(m, scene.camera, scene.target, scene.board).model for m in labels_only.models(scene, observed)]
     assert image_sigma_factors(models, scene.camera).all == pytest.approx(1.0, abs=0.05)
