@@ -1,6 +1,8 @@
-"""Bodies whose faces are boards or tags: no dot board and no camera file are needed."""
+"""Bodies whose faces are boards or tags: no dot board and no camera file are needed. Faces that are not where the
+design draws them, and groups that show others than they are named after."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,26 +11,27 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stcal import Camera, Rigid, StcalError, camera_prior
+from stcal import Camera, Rigid, StcalError, camera_prior, reference_target
 from stcal.boards.finders import shift_by_curves
 from stcal.boards.target_file import load_target, target_toml
-from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
+from stcal.design import KnownDistance, StatedSize, scale_reference, with_drawn_size
 from stcal.drawing.draw import net_text
 from stcal.labels import CircleLabel
-from stcal.sfm import RunOptions, Tracker, compare, pipeline
+from stcal.sfm import RunOptions, Tracker, compare, load_run, pipeline
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import find_scale, refine, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.budget.combine import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
-from stcal.sfm.data.group_model import ImageObservations
+from stcal.sfm.checks.suite import cause_of_drawing
+from stcal.sfm.data.group_model import NOT_AS_DRAWN, ImageObservations, misnamed_groups, not_as_drawn
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.mapping.body import model_of_body, place_and_find_camera, place_with_camera
-from stcal.sfm.planning.session import PlanOptions, plan, plan_text, planned_photographs
-from stcal.sfm.report.judgement import TESTED_BY
-from stcal.sfm.runs.saved import adjusted_run, load_run
+from stcal.sfm.mapping.body import BodyCorners, model_of_body, place_and_find_camera, place_with_camera, wrong_sizes
+from stcal.sfm.planning.session import PlanOptions, corners_seen, plan, plan_text, planned_photographs
+from stcal.sfm.report.judgement import TESTED_BY, judgement_of
+from stcal.sfm.runs.saved import adjusted_run
 from stcal.synthetic.body_scene import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import FULL, sampled
@@ -37,7 +40,7 @@ from tests.support.image_poses import pose_error
 
 pytestmark = pytest.mark.slow
 
-CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
+REAL_CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
 THREE = tag_body("cube", "60", "APRILTAG_36h11", 0, "1,2,3")
 """A cube with tags on three faces alone, of which few images show each often enough."""
@@ -114,36 +117,18 @@ def test_circles_without_a_board_need_a_camera_and_tags_take_no_options_for_circ
 def observed(target, count: int, seed: int, distance_mm: float = 300):
     """Corners of a body in images, with noise, as detection would give them; and the scene."""
     scene = make_body_scene(target, body_camera(1200), BodyOptions(images=count, distance_mm=distance_mm, seed=seed))
-    rng = np.random.default_rng(seed)
-    images = []
-    for i, pose in enumerate(scene.camera_from_target):
-        labels: list[CircleLabel] = []
-        pixels = []
-        for face in target.faces:
-            camera_from_face = pose @ scene.target_from_face[face.id]
-            middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-            if -face.outward * camera_from_face.rotation[:, 2] @ middle > 0.3 * np.linalg.norm(middle):
-                labels += face.labels()
-                pixels.append(scene.camera.project(camera_from_face @ face.places_mm(face.ids)))
-        xy = np.concatenate(pixels)
-        xy = xy + rng.normal(0, SIGMA_PX, xy.shape)
-        zero = np.zeros((len(xy), 2, 2))
-        images.append(
-            ImageObservations(f"{i}.png", ".", tuple(labels), xy, 0 * xy, zero, zero + SIGMA_PX**2 * np.eye(2))
-        )
-    return scene, images
+    return scene, with_noise(corners_seen(scene, SIGMA_PX)[0], np.random.default_rng(seed), SIGMA_PX)
+
+
+def with_noise(images, rng, sigma_px):
+    return [replace(i, centre_px=i.centre_px + rng.normal(0, sigma_px, i.centre_px.shape)) for i in images]
 
 
 def calibrated(target, images, size):
     start = Camera.of(start_camera(*size, "OPENCV"), "OPENCV")
     body = place_and_find_camera(images, target.faces, [start])
     camera = body.camera
-    images = [
-        ImageObservations(
-            i.name, i.group, i.labels, i.centre_px, camera.normalised_from_pixel(i.centre_px), i.shape, i.covariance_px2
-        )
-        for i in images
-    ]
+    images = [replace(i, centre=camera.normalised_from_pixel(i.centre_px)) for i in images]
     board = scale_reference(None, target)
     model = refine(model_of_body(body, images, camera), camera, target, board).model
     options = AdjustOptions(target.faces[0].id, refine_camera=True)
@@ -421,7 +406,7 @@ def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path, 
 
 
 @FULL
-@pytest.mark.skipif(not CUBE.is_dir(), reason="real photographs are not shipped")
+@pytest.mark.skipif(not REAL_CUBE.is_dir(), reason="real photographs are not shipped")
 def test_a_real_cube_of_charuco_boards(tmp_path):
     faces = "".join(
         f'\n[[face]]\nid = "{k}"\nboard = {{ type = "charuco", rows = 10, columns = 10, square_mm = 3.2, '
@@ -429,7 +414,7 @@ def test_a_real_cube_of_charuco_boards(tmp_path):
         for k in range(6)
     )
     target = written(tmp_path, f'name = "cube"\n{faces}')
-    result = pipeline.run(CUBE / "cam0", None, tmp_path / "r", target)
+    result = pipeline.run(REAL_CUBE / "cam0", None, tmp_path / "r", target)
     mapped = sum(len(s.model.images) + len(s.left_out) for s in result.solutions)
     assert mapped + len(result.detection.skipped) == 24
     assert sum(len(s.model.images) for s in result.solutions) == 24
@@ -441,3 +426,120 @@ def test_a_real_cube_of_charuco_boards(tmp_path):
     beside = angles[(angles > 45) & (angles < 135)]
     assert len(beside) == 24
     assert np.abs(beside - 90).max() < 1.5
+
+
+CUBE = tag_cube(60.0)
+
+
+def found(size: float = 1.0, seed: int = 1) -> dict[str, Rigid]:
+    """The cube made to 5° and 3 mm, in the frame of its third face."""
+    rng, rough = np.random.default_rng(seed), CUBE.rough_poses()
+    off = [Rigid.exp([*rng.normal(0, np.radians(3), 3), *rng.normal(0, 1.5, 3)]) for _ in rough]
+    third = rough["3"].inverse()
+    return {
+        face: Rigid((at := third @ pose @ error).rotation, size * at.translation)
+        for (face, pose), error in zip(rough.items(), off, strict=True)
+    }
+
+
+def test_a_body_as_drawn_says_nothing():
+    assert [not_as_drawn(found(seed=seed), CUBE) for seed in range(5)] == [[]] * 5
+    assert not_as_drawn({"1": Rigid()}, CUBE) == []
+
+
+def test_sizes_and_faces_that_are_not_as_drawn_are_named():
+    [size] = not_as_drawn(found(0.1), CUBE)
+    assert re.match(r"not as drawn: faces are 0\.(1|09\d|10) times as far from one another as their rough_pose", size)
+    poses = found()
+    poses["2"], poses["5"] = poses["5"], poses["2"]
+    [turned] = not_as_drawn(poses, CUBE)
+    assert "as if the names of faces 2 and 5 were exchanged" in turned
+    turn = Rigid.exp([0, 0, np.pi / 2, 0, 0, 0])
+    poses = found()
+    [turned] = not_as_drawn(poses | {"4": poses["4"] @ turn}, CUBE)
+    assert "face 4 is turned by 9" in turned or "face 4 is turned by 8" in turned
+    assert "exchanged" not in turned
+    one, other = (poses["4"] @ Rigid.exp([np.radians(turned), 0, 0, 0, 0, 0]) for turned in (30.0, 60.0))
+    assert cause_of_drawing(poses | {"4": one}, CUBE) is None
+    cause = cause_of_drawing(poses | {"4": other}, CUBE)  # it is on another side
+    assert (cause.verdict, cause.names) == ("failed", ("4",))
+    assert "face 4 is not where its rough_pose has it" in cause.title
+
+
+def seen(group: str, *faces: str) -> list[ImageObservations]:
+    labels = tuple(f"{face}:{circle}" for face in faces for circle in "abcd")
+    n = len(labels)
+    empty = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
+    return [ImageObservations(f"{group}/{i}", group, labels, *empty) for i in range(3)]
+
+
+def test_groups_that_show_other_faces_than_their_names_say():
+    target = reference_target()
+    assert misnamed_groups([*seen("12", "1", "2"), *seen("left", "3", "4"), *seen("14", "1")], target) == []
+    aside = [*seen("12", "1", "3"), *seen("12", "1", "3"), *seen("12", "2")[:1]]  # face 2 is in sight once
+    assert len(misnamed_groups(aside, target)) == 1
+    assert misnamed_groups([*seen("12", "1", "2", "3"), *seen("12", "1", "3")], target) == []
+    [note] = misnamed_groups([*seen("12", "1", "3"), *seen("14", "1", "4")], target)
+    assert note.startswith("not as drawn: group 12 is named after faces 1 and 2, and shows 1 and 3: correct")
+
+
+@pytest.mark.parametrize("what", sampled(["size", "id"]))
+def test_one_tag_of_another_size_or_id_is_named(tmp_path, no_page, what):
+    write_body(
+        tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
+    )
+    text = target_toml(CUBE)
+    second = [line for line in text.splitlines() if "size_mm = " in line and "dictionary" in line][1]
+    old, new = {"size": (second, second.replace("size_mm = 45.0", "size_mm = 40.0")), "id": ("id = 2,", "id = 77,")}[
+        what
+    ]
+    (path := tmp_path / "target.toml").write_text(text.replace(old, new), encoding="utf-8")
+    result = pipeline.run(tmp_path / "set/images", tmp_path / "set/cameras.txt", tmp_path / "run", path)
+    scales = next(check for check in result.checks if check.key == "scales")
+    if what == "size":
+        assert (scales.verdict, scales.names) == ("failed", ("face 2",))
+        assert scales.reason.startswith("face 2 would fit with 1.1")
+        assert result.judgement.verdict == "no"
+    else:
+        assert scales.verdict != "failed"
+        assert any("tag 2 of dict_apriltag_36h11" in note.lower() and "not 77 of" in note for note in result.notes)
+
+
+def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
+    report = load_run(small_run).report
+    drawn = {"code": NOT_AS_DRAWN, "words": "faces are 0.1 times as far", "remedy": "check the sizes"}
+    notes = [*report["notes"], drawn]
+    report["options"]["expect_faces"] = list(report["faces"])
+    assert judgement_of(report).verdict == "yes"
+    judged = judgement_of(report | {"notes": notes})
+    assert judged.verdict == "with care"
+    assert "; faces are 0.1 times as far" in judged.use
+    assert judged.limit == "The drawing: faces are 0.1 times as far."
+    assert judged.next.startswith("Check the sizes.")
+
+
+@pytest.fixture(scope="module")
+def corners():
+    """The cube's scene, and its corners in 16 images."""
+    scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
+    return scene, corners_seen(scene, 0.02)[0]
+
+
+def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted_but_of_two_faces_none(corners):
+    """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
+    scene, images = corners
+    rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
+    noisy = with_noise(images, np.random.default_rng(0), 0.02)
+    assert wrong_sizes(BodyCorners(noisy, CUBE.faces), rough)[0] == {}
+    for faces, factor in (((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)):
+        drawn = list(CUBE.faces)
+        for face in faces:
+            drawn[face] = replace(drawn[face], xy_mm=drawn[face].xy_mm / factor)
+        found = wrong_sizes(BodyCorners(noisy, tuple(drawn)), rough)[0]
+        assert sorted(found) == sorted(faces)
+        assert list(found.values()) == pytest.approx([factor] * len(faces), rel=0.05)
+        refuses(f"E-BODY-SIZES … face {CUBE.faces[faces[0]].id}", place_with_camera, noisy, drawn, rough)
+    one, two = (next(face for face in CUBE.faces if face.id == name) for name in ("1", "5"))
+    said = "faces 1 and 5 contradict one another … face 5 is 10 times as large against face 1"
+    small = [one, replace(two, xy_mm=two.xy_mm / 10)]
+    refuses(f"E-BODY-SIZES … {said}", place_with_camera, images, small, scene.camera)

@@ -12,7 +12,7 @@ from PIL import Image
 
 import stcal
 from stcal import load_board, load_target, save_board, save_target, sfm
-from stcal.cli.main import LIBRARIES, main, main_sfm
+from stcal.cli.main import LIBRARIES, main
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import json_text
 from stcal.sfm.planning.session import plan_text
@@ -118,24 +118,15 @@ def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
     refuses(f"E-RUN-FOLDER … {tmp_path}", call, tmp_path)
 
 
-@pytest.fixture
-def command(monkeypatch, capsys):
-    def call(*arguments, entry=main_sfm):
-        monkeypatch.setattr(sys, "argv", ["stcal-sfm", *map(str, arguments)])
-        return ended(entry, capsys)
-
-    return call
-
-
-def test_init_writes_the_reference_design_and_overwrites_nothing(command, tmp_path):
-    code, out, _ = command("init", tmp_path / "mine")
+def test_init_writes_the_reference_design_and_overwrites_nothing(stcal_sfm, tmp_path):
+    code, out, _ = stcal_sfm("init", tmp_path / "mine")
     assert code == 0
     assert "target.toml" in out
     assert "board.toml" in out
     target, board = load_target(tmp_path / "mine" / "target.toml"), load_board(tmp_path / "mine" / "board.toml")
     assert [f.id for f in target.faces] == ["1", "2", "3", "4", "5"]
     assert (board.rows, board.columns, board.pitch_mm, board.radius_mm) == (7, 9, 30.0, 7.5)
-    code, _, err = command("init", tmp_path / "mine")
+    code, _, err = stcal_sfm("init", tmp_path / "mine")
     assert code == 2
     assert "exists" in err
     text = (tmp_path / "mine" / "board.toml").read_text()  # what is written as a remark may be used
@@ -147,12 +138,12 @@ def test_init_writes_the_reference_design_and_overwrites_nothing(command, tmp_pa
 
 @pytest.mark.parametrize(("solve", "faces", "word"), [("joint", "1,2,4", "Yes"), ("chain", "1,3", "Part, with care: ")])
 def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(
-    command, small_set, no_page, solve, faces, word
+    stcal_sfm, small_set, no_page, solve, faces, word
 ):
     """Face 3 is not in the photographs; a chain is faster, and never a plain yes."""
     small = small_set("12", "14")
     files = ["--target", small.folder / "target.toml", "--board", small.folder / "board.toml"]
-    code, out, err = command(
+    code, out, err = stcal_sfm(
         *small.arguments(*files, "--solve", solve, "--expect-faces", faces, "--no-strict", "--quiet")
     )
     assert (code, out) == (0, "")
@@ -169,25 +160,25 @@ def designs(tmp_path):
     return "--target", tmp_path / "target.toml", "--board", tmp_path / "board.toml"
 
 
-def test_simulate_with_the_camera_of_a_file(command, designs, tmp_path):
+def test_simulate_with_the_camera_of_a_file(stcal_sfm, designs, tmp_path):
     camera = tmp_path / "cameras.txt"
     camera.write_text("1 SIMPLE_RADIAL 400 300 430 203 148 -0.05\n")
     call = "simulate", tmp_path / "data", *designs, "--camera", camera, "--images", 2, "--workers", 1
-    code, text, _ = command(*call)
+    code, text, _ = stcal_sfm(*call)
     assert code == 0
     assert "2 images in 1 groups" in text
     written, given = (read_camera(path).calibrated(0, 0) for path in (tmp_path / "data" / "cameras.txt", camera))
     assert written.colmap_params() == given.colmap_params()
-    code, _, err = command(*call, "--fisheye", 100)
+    code, _, err = stcal_sfm(*call, "--fisheye", 100)
     assert code == 2
     assert "two cameras" in err
 
 
 @pytest.mark.slow
-def test_simulate_with_lens_and_rim(command, tmp_path):
+def test_simulate_with_lens_and_rim(stcal_sfm, tmp_path):
     small = "--width", 324, "--images", 2, "--workers", 1
     lens = "--f-number", 4, "--focus-mm", 900, "--rim-mm", 0.2
-    code, _, err = command("simulate", tmp_path / "data", *small, *lens)
+    code, _, err = stcal_sfm("simulate", tmp_path / "data", *small, *lens)
     assert code == 0, err
     optics = json.loads((tmp_path / "data/truth.json").read_text())["optics"]
     assert optics == {"lens": {"f_number": 4.0, "focal_mm": 24.0, "focus_mm": 900.0}, "rim_mm": 0.2}
@@ -199,24 +190,25 @@ def test_simulate_with_lens_and_rim(command, tmp_path):
         (("--f-number", 4, "--fisheye", 120, "--distance", 500), "perspective"),
         (("--f-number", 4, "--focus-mm", 20), "focal length"),
     ):
-        code, _, err = command("simulate", tmp_path / "none", *small, *options)
+        code, _, err = stcal_sfm("simulate", tmp_path / "none", *small, *options)
         assert (code, err.count("error:")) == (2, 1)
         assert names in err
     assert not (tmp_path / "none").exists()
 
 
-def test_simulate_says_which_faces_have_no_place(command, designs, tmp_path):
+def test_simulate_says_which_faces_have_no_place(stcal_sfm, designs, tmp_path):
     target = load_target(designs[1])
     first, second = target.faces
     save_target(designs[1], replace(target, faces=(first, replace(second, rough_target_from_face=None))))
-    code, _, err = command("simulate", tmp_path / "data", *designs)
+    code, _, err = stcal_sfm("simulate", tmp_path / "data", *designs)
     assert code == 2
     assert f"does not say where face {second.id} is; add approximate rough_pose = {{ origin_mm, x, normal }}" in err
 
 
-def test_versions_for_reports_of_faults(command, monkeypatch):
+def test_versions_for_reports_of_faults(monkeypatch, capsys):
     """Also where COLMAP is not there, or a library does not load."""
-    code, out, _ = command("--versions", entry=main)
+    monkeypatch.setattr(sys, "argv", ["stcal", "--versions"])
+    code, out, _ = ended(main, capsys)
     found = dict(line.split(maxsplit=1) for line in out.splitlines() if not line.startswith("native"))
     assert code == 0
     assert found["stcal"] == stcal.__version__
@@ -224,7 +216,7 @@ def test_versions_for_reports_of_faults(command, monkeypatch):
     assert found["pycolmap"].startswith("4.2")
     monkeypatch.setenv("PATH", "")
     monkeypatch.setitem(LIBRARIES, "OpenCV", "no_such_module")
-    again = command("--versions")[1]
+    again = ended(main, capsys)[1]
     assert "native colmap  not found" in again
     assert "OpenCV         does not load: No module named 'no_such_module'" in again
 
