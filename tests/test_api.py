@@ -63,7 +63,7 @@ def arguments(value: object) -> set[str]:
 PUBLIC = public()
 
 
-def test_public_names_are_shown_listed_and_documented():
+def test_public_names_are_shown_listed_documented_and_stand_for_one_thing_in_folders_seen_at_a_glance():
     """Sixty at this writing; an empty ``__all__`` would let everything below pass. They are listed before they are
     loaded, in a process of its own: here all have been used. Every argument or field stands in the docstring."""
     assert len(PUBLIC) > 40
@@ -75,50 +75,20 @@ def test_public_names_are_shown_listed_and_documented():
     assert printed.splitlines() == ["[] True"] * (1 + len(SYSTEMS))
     named = {name: set(re.findall(r"\w+", value.__doc__ or "")) for name, value in PUBLIC.items()}
     assert {name: missing for name, value in PUBLIC.items() if (missing := arguments(value) - named[name])} == {}
+    counts = Counter(path.parent for path in FILES)
+    assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
+    entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
+    assert len(entries) <= MOST_ENTRIES
+    assert [path for path in FILES if path.stem == path.parent.name] == []
+    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
+    assert {stem: n for stem, n in stems.items() if n > 1} == {}
+    for system in SYSTEMS[:5]:
+        names = importlib.import_module(f"stcal.{system}").__all__
+        assert {each.stem for each in (ROOT / system).iterdir()} & set(names) == set()
 
 
 FACE, TWO = reference_target().faces[:2]
 ROW = DHRow(100.0, 0.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("make", "error"),
-    [
-        (lambda: Joint("Prismatic"), "E-OPTION-VALUE … 'Prismatic' … revolute or prismatic"),
-        (lambda: Joint(lower=1.0, upper=-1.0), "E-ROBOT-LIMITS … 1 … -1"),
-        (lambda: Joint(fixed={"alpha_deg": "why"}), "E-ROBOT-FIXED … alpha_deg … alpha"),
-        (lambda: DHRow(float("nan"), 0, 0, 0), "E-ROBOT-ROW … a … nan"),
-        (lambda: DHRow(0, "0", 0, 0), "E-ROBOT-ROW … alpha … '0'"),
-        (lambda: Robot("a", "Modified", (ROW,), (Joint(),)), "E-OPTION-VALUE … robot a … 'Modified'"),
-        (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-ROBOT-ENTRIES … DHRow"),
-        (lambda: Robot("a", "modified", (DHRow(0.4, 0, 0.1, 0),), (Joint(),)), "E-LENGTH-UNIT … 0.4 mm … metres"),
-        (lambda: TargetDesign("t", "black", (FACE,)), "E-OPTION-VALUE … 'black' … bright or dark"),
-        (
-            lambda: TargetDesign("t", "dark", (replace(FACE, xy_mm=FACE.xy_mm / 1e3, radius_mm=FACE.radius_mm / 1e3),)),
-            "E-LENGTH-UNIT … metres",
-        ),
-        (lambda: replace(FACE, ids=FACE.ids[:-1]), "E-ARRAY-SHAPE … face 1"),
-        (lambda: replace(FACE, radius_mm=0 * FACE.radius_mm), "E-TARGET-RADIUS … 0 mm"),
-        (lambda: replace(FACE, radius_mm=-FACE.radius_mm), "E-TARGET-RADIUS … -"),
-        (lambda: replace(reference_board(), polarity="black"), "E-OPTION-VALUE … 'black'"),
-        (lambda: replace(reference_board(), pitch_mm=0.03, radius_mm=0.01), "E-LENGTH-UNIT … 0.03 mm"),
-        (lambda: replace(reference_board(), rows=0), "E-BOARD-SIZE … 0 rows"),
-        (lambda: replace(reference_board(), corner=(0, 0)), "E-BOARD-CORNER … None"),
-        (lambda: replace(reference_board(), sigma_mm=-1.0), "E-SIGMA-VALUE … -1"),
-        (lambda: RunOptions(solve="Joint"), "E-OPTION-VALUE … solve 'Joint' … joint"),
-        (lambda: IdentifyOptions(model="stiff"), "E-OPTION-VALUE … model 'stiff'"),
-        (lambda: DesignOptions(observe="poses"), "E-OPTION-VALUE … observe 'poses'"),
-        (lambda: RunOptions(workers=0), "E-OPTION-RANGE … workers 0 … 1"),
-        (lambda: RunOptions(exclude="12/a.jpg"), "E-FIELD-TYPE … exclude '12/a.jpg' … tuple"),
-        (lambda: replace(FACE, xy_mm=[["0", "1"]] * len(FACE.ids)), "E-ARRAY-TYPE … face 1"),
-        (lambda: Rigid.exp([0] * 6) and Rigid(translation=[0, "1", 2]), "E-ARRAY-TYPE … translation"),
-        (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]), "E-ARRAY-TYPE … rows … whole"),
-        (lambda: Camera(2.5, 3, [1, 1], [1, 1], [0] * 8), "E-FIELD-TYPE … width 2.5 … whole"),
-        (lambda: HandEyePoses(Poses.of([Rigid()]).matrix(), Poses.of([Rigid()])), "E-FIELD-TYPE … Poses"),
-    ],
-)
-def test_constructors_are_as_strict_as_readers_of_files(make, error):
-    refuses(error, make)
 
 
 def wrong_values(value: object, hint: object) -> list[object]:
@@ -176,7 +146,8 @@ INPUTS = [
 
 
 @pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
-def test_no_field_takes_a_value_of_another_type(made):
+def test_no_field_takes_a_value_of_another_type_a_copy_is_equal_and_a_value_shows_itself_in_a_line(made):
+    """Results with many values: in `tests/sfm/runs/test_results.py`, and by what they are made of."""
     hints, taken = get_type_hints(type(made)), []
     for entry in (each for each in dataclasses.fields(made) if each.init):
         for value in wrong_values(getattr(made, entry.name), hints[entry.name]):
@@ -188,11 +159,6 @@ def test_no_field_takes_a_value_of_another_type(made):
                 continue
             taken.append((entry.name, value))
     assert taken == []
-
-
-@pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
-def test_a_copy_of_a_value_is_equal_and_a_value_shows_itself_in_a_line(made):
-    """Results with many values: in `tests/sfm/runs/test_results.py`, and by what they are made of."""
     for again in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert (again, hash(again)) == (made, hash(made))
     assert len(repr(made)) < 600
@@ -237,19 +203,6 @@ FILES = sorted(path.relative_to(ROOT) for path in ROOT.rglob("*.py"))
 MOST_FILES = 14
 """Most files of a folder: what can be seen at a glance."""
 MOST_ENTRIES = 16  # most folders and files of `sfm/`
-
-
-def test_folders_can_be_seen_at_a_glance_and_names_stand_for_one_thing():
-    counts = Counter(path.parent for path in FILES)
-    assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
-    entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
-    assert len(entries) <= MOST_ENTRIES
-    assert [path for path in FILES if path.stem == path.parent.name] == []
-    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
-    assert {stem: n for stem, n in stems.items() if n > 1} == {}
-    for system in SYSTEMS[:5]:
-        names = importlib.import_module(f"stcal.{system}").__all__
-        assert {each.stem for each in (ROOT / system).iterdir()} & set(names) == set()
 
 
 def test_another_distribution_beside_the_package_is_refused_at_import(tmp_path):
@@ -298,6 +251,37 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
 @pytest.mark.parametrize(
     ("make", "error"),
     [
+        (lambda: Joint("Prismatic"), "E-OPTION-VALUE … 'Prismatic' … revolute or prismatic"),
+        (lambda: Joint(lower=1.0, upper=-1.0), "E-ROBOT-LIMITS … 1 … -1"),
+        (lambda: Joint(fixed={"alpha_deg": "why"}), "E-ROBOT-FIXED … alpha_deg … alpha"),
+        (lambda: DHRow(float("nan"), 0, 0, 0), "E-ROBOT-ROW … a … nan"),
+        (lambda: DHRow(0, "0", 0, 0), "E-ROBOT-ROW … alpha … '0'"),
+        (lambda: Robot("a", "Modified", (ROW,), (Joint(),)), "E-OPTION-VALUE … robot a … 'Modified'"),
+        (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-ROBOT-ENTRIES … DHRow"),
+        (lambda: Robot("a", "modified", (DHRow(0.4, 0, 0.1, 0),), (Joint(),)), "E-LENGTH-UNIT … 0.4 mm … metres"),
+        (lambda: TargetDesign("t", "black", (FACE,)), "E-OPTION-VALUE … 'black' … bright or dark"),
+        (
+            lambda: TargetDesign("t", "dark", (replace(FACE, xy_mm=FACE.xy_mm / 1e3, radius_mm=FACE.radius_mm / 1e3),)),
+            "E-LENGTH-UNIT … metres",
+        ),
+        (lambda: replace(FACE, ids=FACE.ids[:-1]), "E-ARRAY-SHAPE … face 1"),
+        (lambda: replace(FACE, radius_mm=0 * FACE.radius_mm), "E-TARGET-RADIUS … 0 mm"),
+        (lambda: replace(FACE, radius_mm=-FACE.radius_mm), "E-TARGET-RADIUS … -"),
+        (lambda: replace(reference_board(), polarity="black"), "E-OPTION-VALUE … 'black'"),
+        (lambda: replace(reference_board(), pitch_mm=0.03, radius_mm=0.01), "E-LENGTH-UNIT … 0.03 mm"),
+        (lambda: replace(reference_board(), rows=0), "E-BOARD-SIZE … 0 rows"),
+        (lambda: replace(reference_board(), corner=(0, 0)), "E-BOARD-CORNER … None"),
+        (lambda: replace(reference_board(), sigma_mm=-1.0), "E-SIGMA-VALUE … -1"),
+        (lambda: RunOptions(solve="Joint"), "E-OPTION-VALUE … solve 'Joint' … joint"),
+        (lambda: IdentifyOptions(model="stiff"), "E-OPTION-VALUE … model 'stiff'"),
+        (lambda: DesignOptions(observe="poses"), "E-OPTION-VALUE … observe 'poses'"),
+        (lambda: RunOptions(workers=0), "E-OPTION-RANGE … workers 0 … 1"),
+        (lambda: RunOptions(exclude="12/a.jpg"), "E-FIELD-TYPE … exclude '12/a.jpg' … tuple"),
+        (lambda: replace(FACE, xy_mm=[["0", "1"]] * len(FACE.ids)), "E-ARRAY-TYPE … face 1"),
+        (lambda: Rigid.exp([0] * 6) and Rigid(translation=[0, "1", 2]), "E-ARRAY-TYPE … translation"),
+        (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]), "E-ARRAY-TYPE … rows … whole"),
+        (lambda: Camera(2.5, 3, [1, 1], [1, 1], [0] * 8), "E-FIELD-TYPE … width 2.5 … whole"),
+        (lambda: HandEyePoses(Poses.of([Rigid()]).matrix(), Poses.of([Rigid()])), "E-FIELD-TYPE … Poses"),
         (lambda: Camera.from_opencv(SKEWED, [], SIZE), "E-CAMERA-MATRIX … 2.0 … skew"),
         (lambda: Camera.from_opencv(MATRIX[:2], [], SIZE), "E-ARRAY-SHAPE … (2, 3)"),
         (lambda: Camera.from_opencv(MATRIX, EIGHT[:6], SIZE), "E-CAMERA-COEFFICIENTS … 6 … 4, 5, 8"),
@@ -325,7 +309,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
         (lambda: sfm.Tracker("target", Camera.from_opencv(MATRIX, [], SIZE)), "E-FACES-DESIGN … str … circles()"),
     ],
 )
-def test_what_is_wrong_is_refused_in_one_line(make, error):
+def test_constructors_are_as_strict_as_readers_of_files(make, error):
     refuses(error, make)
 
 
@@ -408,13 +392,18 @@ def test_checks_of_ones_own_have_their_own_names_and_lose_no_result():
         assert first.key != second.key
 
 
-def test_the_repr_of_a_large_result_is_a_line():
+def test_the_repr_of_a_large_result_is_a_line_that_tells_the_notes():
     """A notebook prints it."""
     pair = np.random.default_rng(0).uniform(-100, 100, (60, 3))
     result = stcal.register.register(pair, pair + np.array([1.0, 2.0, 3.0]))
     assert repr(result).startswith("Registration(")
     assert len(repr(result)) < 1000
     assert "\n" not in repr(result)
+    pair = np.random.default_rng(0).uniform(-100, 100, (20, 3))
+    off = pair + np.eye(20, 3) * 9.0
+    result = stcal.register.register(pair, off, method="least-squares")
+    assert result.notes
+    assert result.notes[0] in repr(result)
 
 
 def test_masked_values_are_refused_where_arrays_are_taken():
@@ -424,14 +413,6 @@ def test_masked_values_are_refused_where_arrays_are_taken():
     other.mask[4] = True
     for call in (lambda: stcal.register.register(pair, other), lambda: frozen(other)):
         refuses("E-ARRAY-NOT-FINITE … 3 values are masked; leave out their rows", call)
-
-
-def test_a_repr_tells_the_notes():
-    pair = np.random.default_rng(0).uniform(-100, 100, (20, 3))
-    off = pair + np.eye(20, 3) * 9.0
-    result = stcal.register.register(pair, off, method="least-squares")
-    assert result.notes
-    assert result.notes[0] in repr(result)
 
 
 @pytest.mark.parametrize("scale", [1, 257])

@@ -142,16 +142,13 @@ def test_threads_and_what_is_left_of_them(said, program, answer):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # what it is about
-def test_a_process_of_a_pool_works_alone():
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_process_of_a_pool_works_alone_and_a_forked_one_starts_its_own():
+    """The server of the process that forked it answers that one alone."""
     with multiprocessing.get_context("fork").Pool(1) as pool:
         found, notes = pool.apply(in_a_pool)
     assert found == [(0, 8), (1, 8)]
     assert notes == ["a process of multiprocessing.Pool may start no others: one process works, more slowly"]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_process_starts_its_own():
-    """The server of the process that forked it answers that one alone."""
     dict(run_parallel(process, [(0,), (1,)], 2))
     with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
         assert pool.submit(in_a_pool).result(60) == ([(0, 8), (1, 8)], [])

@@ -131,16 +131,13 @@ def test_a_file_for_standard_output_needs_one_that_is_open(monkeypatch):
             terminal.write(terminal.STANDARD_OUTPUT, {})
 
 
-def test_h_is_help():
+def test_help_shows_a_dozen_options_all_on_demand_each_once_and_h_is_help():
     """Of the program, of each group and of each command; the same text as with the whole word."""
     for words in ("", *COMMANDS):
         short, long = (CliRunner().invoke(app, [*words.split(), option]) for option in ("-h", "--help"))
         assert (short.exit_code, short.output) == (0, long.output), words
         assert short.output.startswith("Usage: "), words
         assert re.search(r"-h, --help +Show this message and exit\.", short.output), words
-
-
-def test_help_shows_a_dozen_options_and_all_on_demand_each_once():
     used = set()
     for words, callback in COMMANDS.items():
         each = [CliRunner().invoke(app, [*words.split(), option]).output for option in ("--help", "--help-all")]
@@ -236,7 +233,8 @@ def test_a_command_that_works_in_silence_says_what_it_is_at(capsys, monkeypatch,
     assert len(said) in ((0,) if quiet or waits else (1, 2, 3))
 
 
-def test_a_quiet_command_says_errors_and_warnings_alone(program, tmp_path, capsys):
+def test_a_quiet_command_says_errors_warnings_and_a_verdict_that_is_not_good_alone(program, tmp_path, capsys):
+    """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
     for word in ("--quiet", "-q"):
         assert program("robot", "init", tmp_path / "a.toml", word) == (0, "", "")
         assert (tmp_path / "a.toml").exists()
@@ -245,24 +243,20 @@ def test_a_quiet_command_says_errors_and_warnings_alone(program, tmp_path, capsy
         terminal.print_each("note", ["a"])
         terminal.print_each("warning", ["b\x1b"])
     assert capsys.readouterr() == ("", "warning: b?\n")
+    for rule in RULES:
+        for failed, verdict in ((["a", "b"], "do not use: a"), ([], "with care: c")):
+            with terminal.manner(True, False):
+                rule(False, failed, None, verdict)
+                assert capsys.readouterr() == ("", f"warning: {verdict}\n")
+                rule(False, [], None)
+                if failed:
+                    refuses("E-CHECKS-FAILED … a", rule, True, failed, None, verdict)
+            with terminal.manner(False, False):
+                rule(False, failed, None, verdict)
+            assert capsys.readouterr() == ("", "")
 
 
 RULES = (options.require_passed, options.require_usable)
-
-
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize(("failed", "verdict"), [(["a", "b"], "do not use: a"), ([], "with care: c")])
-def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, verdict):
-    """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
-    with terminal.manner(True, False):
-        rule(False, failed, None, verdict)
-        assert capsys.readouterr() == ("", f"warning: {verdict}\n")
-        rule(False, [], None)
-        if failed:
-            refuses("E-CHECKS-FAILED … a", rule, True, failed, None, verdict)
-    with terminal.manner(False, False):
-        rule(False, failed, None, verdict)
-    assert capsys.readouterr() == ("", "")
 
 
 def test_files_are_written_before_a_reader_such_as_head_ends_the_command(tmp_path, monkeypatch):
@@ -327,8 +321,9 @@ def test_no_output_replaces_an_input_or_a_file_in_silence(tmp_path):
     assert place.read_text() == "a better one"
 
 
-def test_overwrite_replaces_what_is_there(tmp_path, monkeypatch, capsys):
-    """The table of an earlier call, and only with the option."""
+def test_overwrite_replaces_what_is_there_and_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch, capsys):
+    """The table of an earlier call, and only with the option. `measure --serve` beside an earlier poses.csv: the file
+    of the camera is what is refused."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "b.toml").write_text("mine")
 
@@ -340,10 +335,6 @@ def test_overwrite_replaces_what_is_there(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "b.toml").read_text() == "mine"
     assert init("--overwrite")[::2] == (0, "")
     assert "[[joint]]" in (tmp_path / "b.toml").read_text()
-
-
-def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
-    """`measure --serve` beside an earlier poses.csv; the file of the camera is what is refused."""
     monkeypatch.chdir(tmp_path)
     Path("poses.csv").write_text("an earlier table")
     given = {"camera": tmp_path / "none.txt", "faces": tmp_path / "none.json", "out": Path("poses.csv")}

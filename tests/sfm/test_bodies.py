@@ -62,7 +62,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_faces_of_boards_and_tags_are_read_and_written_with_their_rough_poses(tmp_path):
+def test_printed_faces_are_read_and_written_with_their_rough_poses_and_mistakes_are_named(tmp_path):
     target = load_target(written(tmp_path, TARGET))
     board, tags = target.faces
     assert (len(board.ids), board.ids[5], board.sigma_mm, board.outward) == (16, "1.1", 0.01, -1)
@@ -82,11 +82,7 @@ def test_faces_of_boards_and_tags_are_read_and_written_with_their_rough_poses(tm
         outward = -face.rough_target_from_face.rotation[:, 2]
         assert outward @ face.rough_target_from_face.translation == pytest.approx(30)
     refuses("E-TARGET-PRINTED … face 0 … stcal-sfm run", load_target, written(tmp_path, TARGET), printed=False)
-
-
-@pytest.mark.parametrize(
-    ("change", "error"),
-    [
+    for change, error in (
         (("first_id = 3", "first_id = 3, pitch_mm = 1"), "E-KEY-UNKNOWN … face 0 … board … pitch_mm"),
         (("id = 3, size_mm", "id = 587, size_mm"), "E-TAG-ID-RANGE … face top … 587"),
         (('type = "charuco"', 'type = "chessboard"'), "E-KEY-UNKNOWN … face 0 … board"),
@@ -96,10 +92,8 @@ def test_faces_of_boards_and_tags_are_read_and_written_with_their_rough_poses(tm
             ('"mixed"', '"mixed"\nscale = [{ from = "0:9.9", to = "0:1.1", mm = 5, sigma_mm = 1 }]'),
             "E-TARGET-SCALE … 0:9.9",
         ),
-    ],
-)
-def test_mistakes_in_printed_faces_are_named(tmp_path, change, error):
-    refuses(error, load_target, written(tmp_path, TARGET.replace(*change)))
+    ):
+        refuses(error, load_target, written(tmp_path, TARGET.replace(*change)))
 
 
 def test_circles_without_a_board_need_a_camera_and_tags_take_no_options_for_circles(tmp_path):
@@ -225,21 +219,19 @@ def size_row(found, board) -> tuple[str, str]:
     return row.origin, row.words
 
 
-@pytest.mark.parametrize(("target", "images", "seed"), [(tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)])
-def test_each_face_is_seen_often_and_squarely(target, images, seed):
-    """Five times, and twice within 45° of the normal; at random, a face of a cube is in two to four of 20 images."""
-    scene = make_body_scene(target, body_camera(900), BodyOptions(images, 300.0, seed=seed))
-    for face in target.faces:
-        normal = face.outward * scene.target_from_face[face.id].rotation[:, 2]
-        middle = scene.target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0)
-        rays = np.array([pose.inverse().translation for pose in scene.camera_from_target]) - middle
-        tilts = np.degrees(np.arccos(rays @ normal / np.linalg.norm(rays, axis=1)))
-        assert (tilts < 61).sum() >= 5  # faces are up to a degree off their design
-        assert (tilts < 46).sum() >= 2
-    assert scene.hardly_seen() == ""
-
-
-def test_faces_that_are_hardly_seen_and_the_distance_that_a_body_needs_are_named():
+def test_each_face_is_seen_often_and_squarely_or_named():
+    """Five times, and twice within 45° of the normal; at random, a face of a cube is in two to four of 20 images. So is
+    the distance that a body needs."""
+    for target, images, seed in ((tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)):
+        scene = make_body_scene(target, body_camera(900), BodyOptions(images, 300.0, seed=seed))
+        for face in target.faces:
+            normal = face.outward * scene.target_from_face[face.id].rotation[:, 2]
+            middle = scene.target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0)
+            rays = np.array([pose.inverse().translation for pose in scene.camera_from_target]) - middle
+            tilts = np.degrees(np.arccos(rays @ normal / np.linalg.norm(rays, axis=1)))
+            assert (tilts < 61).sum() >= 5  # faces are up to a degree off their design
+            assert (tilts < 46).sum() >= 2
+        assert scene.hardly_seen() == ""
     scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(2, 300.0, pose_sigma_mm=0, pose_sigma_deg=0))
     shown = [face.id for image in range(2) for face in scene.faces_in_view(image)]
     for face in scene.target.faces:

@@ -122,9 +122,9 @@ def written(folder, text):
     return path
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was_but_what_is_none(tmp_path):
+    """A gap in metres is no ratio, and the published method needs dots."""
+    for text in (
         'type = "chessboard"\nrows = 6\ncolumns = 9\nsquare_mm = 25.4\nsigma_mm = 0.02\n',
         'type = "charuco"\nrows = 5\ncolumns = 7\nsquare_mm = 20\nmarker_mm = 15\ndictionary = "4X4_50"\n',
         'type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30\nspacing = 0.3\nborder_bits = 1\nfirst_id = 7\n',
@@ -132,20 +132,15 @@ def written(folder, text):
         "target_type: checkerboard\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n",
         'type = "tags"\nunusual_size = true\ntag = [{ dictionary = "tag36h11", id = 3, size_mm = 4000, x_mm = 1.5, '
         "y_mm = 0.3, angle_deg = 20 }]\n",
-    ],
-)
-def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was(tmp_path, text):
-    board = load_board(written(tmp_path, text))
-    flat = load_flat_board(tmp_path / "board.toml")
-    np.testing.assert_allclose(board.places_mm(board.labels())[:, :2], flat.xy_mm(), atol=1e-12)
-    assert len(set(board.labels())) == len(flat.xy_mm())
-    again = load_board(written(tmp_path, board_toml(board)))
-    assert again.labels() == board.labels()
-    assert type(again.printed) is type(flat)
-    np.testing.assert_allclose(again.xy_mm(), flat.xy_mm(), atol=1e-12)
-
-
-def test_a_gap_in_metres_is_no_ratio_and_the_published_method_needs_dots(tmp_path):
+    ):
+        board = load_board(written(tmp_path, text))
+        flat = load_flat_board(tmp_path / "board.toml")
+        np.testing.assert_allclose(board.places_mm(board.labels())[:, :2], flat.xy_mm(), atol=1e-12)
+        assert len(set(board.labels())) == len(flat.xy_mm())
+        again = load_board(written(tmp_path, board_toml(board)))
+        assert again.labels() == board.labels()
+        assert type(again.printed) is type(flat)
+        np.testing.assert_allclose(again.xy_mm(), flat.xy_mm(), atol=1e-12)
     text = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.0264\n"
     refuses("E-BOARD-SPACING … tagSpacing 0.0264 … 0.1 … 0.3", load_board, written(tmp_path, text))
     for option in ("--solve paper", "--compare paper"):

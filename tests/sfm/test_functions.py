@@ -95,8 +95,8 @@ def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
         sfm.plan(session, target, stcal.reference_board())
 
 
-def test_calibrate_models_and_crosscheck_that_names_what_is_missing(stcal_sfm, small_run, tmp_path):
-    """The comparison itself: `interop/test_crosscheck.py`."""
+def test_calibrate_models_and_runs_and_programs_that_are_missing(stcal_sfm, small_run, tmp_path, small_result):
+    """The comparison of programs itself: `interop/test_crosscheck.py`."""
     one, two = tmp_path / "one.json", tmp_path / "two.json"
     assert stcal_sfm("faces", small_run / "colmap/models", "--run", small_run, "--out", one)[0] == 0
     found = sfm.calibrate_models(small_run / "colmap/models", small_run, out=two)
@@ -107,15 +107,10 @@ def test_calibrate_models_and_crosscheck_that_names_what_is_missing(stcal_sfm, s
     assert stcal_sfm("crosscheck", own, "--colmap", program).error == "E-COLMAP-PROGRAM"
     refuses("E-COLMAP-PROGRAM … no-colmap", sfm.crosscheck, small_run, program, sfm.Tolerances(sigma=1.0))
     refuses("E-FIELD-TYPE … tolerances … Tolerances", sfm.crosscheck, small_run, program, 0.5)
-
-
-@pytest.mark.parametrize(
-    "call", [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise], ids=lambda call: call.__name__
-)
-def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
-    refuses("E-FIELD-TYPE … 7", call, 7)
-    refuses("E-RUN-FOLDER … out", call, replace(small_result, out=None))
-    refuses(f"E-RUN-FOLDER … {tmp_path}", call, tmp_path)
+    for call in (sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise):
+        refuses("E-FIELD-TYPE … 7", call, 7)
+        refuses("E-RUN-FOLDER … out", call, replace(small_result, out=None))
+        refuses(f"E-RUN-FOLDER … {tmp_path}", call, tmp_path)
 
 
 def test_init_writes_the_reference_design_and_overwrites_nothing(stcal_sfm, tmp_path):

@@ -155,9 +155,8 @@ def kinds(schedule, *outcome, refused=False) -> set[str]:
 ERROR = "error: pairs.csv: no rows\n"
 
 
-@pytest.mark.parametrize(
-    ("kind", "outcome"),
-    [
+def test_what_must_not_be_is_seen_and_files_are_watched(schedule):
+    for kind, outcome in (
         ("traceback", (None, "", "", 1.0, 0, "Traceback …")),
         ("hang", (None, "", "", 60.0, 0, "too long")),
         ("memory", (2, "", ERROR, 1.0, 3 << 30)),
@@ -169,13 +168,8 @@ ERROR = "error: pairs.csv: no rows\n"
         ("not printable", (2, "", "error: \x1b[31m\n", 1.0)),
         ("noise", (0, "", "RuntimeWarning: overflow\n", 1.0)),
         ("broken result", (0, "", "", 1.0)),
-    ],
-)
-def test_what_must_not_be_is_seen(schedule, kind, outcome):
-    assert kind in kinds(schedule, *outcome)
-
-
-def test_files_are_watched(schedule):
+    ):
+        assert kind in kinds(schedule, *outcome)
     _, folder, read, written, _ = schedule
     assert kinds(schedule, 0, "", "", 1.0, refused=True) >= {"exit code"}
     (read / "register/pairs.csv").write_text("x")

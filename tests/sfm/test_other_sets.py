@@ -107,7 +107,7 @@ def written(folder, text):
     return path
 
 
-def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
+def test_the_lattice_holds_the_circles_and_no_others_and_other_boards_are_refused(tmp_path):
     board = load_board(written(tmp_path, board_toml(CIRCLES.lattice())))
     assert isinstance(board, LatticePart)
     assert board.printed == CIRCLES
@@ -117,9 +117,6 @@ def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
     wanted = np.sort(np.linalg.norm(CIRCLES.xy_mm()[:, None] - CIRCLES.xy_mm(), axis=2).ravel())
     np.testing.assert_allclose(np.sort(np.linalg.norm(xy[:, None] - xy, axis=2).ravel()), wanted, atol=1e-9)
     np.testing.assert_allclose(board.places_mm([DotLabel(*board.cells()[7])])[0, :2], xy[7])
-
-
-def test_other_boards_are_refused_with_what_takes_them(tmp_path):
     several = 'type = "boards"\n[[board]]\nfile = "other.toml"\n'
     refuses("E-BOARD-SINGLE … several boards", load_board, written(tmp_path, several))
     circles = "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n"
@@ -328,7 +325,9 @@ def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, tmp_path):
         assert least < error @ np.linalg.solve(np.array(each["covariance"]), error) < 1.6 * most, name
 
 
-def test_the_report_says_what_the_files_say(calibrated):
+def test_the_report_says_what_the_files_say_and_detections_are_where_the_truth_has_them(calibrated):
+    """Ellipse centres against images of circle centres: eccentricity makes r²cosθ/D of difference, 0.1 px at most here
+    (r = 7.5 mm, 1 m, f = 1678 px), noise a hundredth."""
     out, text = calibrated.out, calibrated.text
     assert text.startswith("May I use it? ")
     assert len(text.splitlines()) <= 20  # seen at a glance
@@ -341,11 +340,6 @@ def test_the_report_says_what_the_files_say(calibrated):
         for value in np.array(faces[face_id])[:3, 3]:
             assert f"{value:.4f}" in text
             assert f"{value:.4f}" in html.replace("−", "-")
-
-
-def test_detections_are_where_the_truth_has_them(calibrated):
-    """Ellipse centres against images of circle centres: eccentricity makes r²cosθ/D of difference, 0.1 px at most here
-    (r = 7.5 mm, 1 m, f = 1678 px), noise a hundredth."""
     with open(calibrated.out / "labels.csv", newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if not row["label"].startswith("board")]
     images = {name: each for g in calibrated.content()["groups"].values() for name, each in g["images"].items()}

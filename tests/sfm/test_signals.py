@@ -24,19 +24,15 @@ def ended(process, number) -> tuple[int, list[str]]:
 
 
 @pytest.mark.parametrize(("number", "said", "code"), ENDS)
-def test_while_libraries_load(number, said, code):
-    """The moment is when the entry module is there and the program's imports go on."""
+def test_while_libraries_load_and_where_python_forgets_exceptions(number, said, code):
+    """The moment is when the entry module is there and the program's imports go on. Python prints and forgets
+    exceptions in a finaliser: the signal is sent again, and what the command waits for ends."""
     begin = (
         "import sys; from stcal.cli import entry; entry._answer(); print('on', flush=True); import time; time.sleep(60)"
     )
     process = subprocess.Popen([sys.executable, "-P", "-c", begin], stdout=-1, stderr=-1, text=True)
     assert process.stdout.readline() == "on\n"
     assert ended(process, number) == (code, [said])
-
-
-@pytest.mark.parametrize(("number", "said", "code"), ENDS)
-def test_where_python_forgets_exceptions_a_signal_is_sent_again(number, said, code):
-    """In a finaliser, whose exceptions Python prints and forgets; what the command waits for ends."""
     begin = (
         "import signal, sys, time, typer, weakref; from stcal.cli import entry, main\n"
         "class A: pass\n"

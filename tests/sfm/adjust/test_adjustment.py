@@ -51,8 +51,9 @@ def pose_errors(scene, target):
     return {face: pose_error(pose, scene.target_from_face[face]) for face, pose in poses.items()}
 
 
-def test_adjustments_are_exact_without_noise_and_find_the_eccentricity(scene, labels_only):
-    """Without noise the corrected model is the true one: eccentricity is modelled, not fitted away."""
+def test_adjustments_are_exact_without_noise_find_the_eccentricity_and_state_sigma_of_distances(scene, labels_only):
+    """Without noise the corrected model is the true one: eccentricity is modelled, not fitted away. σ of a distance
+    from the reference, which is held, to another face is what the other's translation may do along the line."""
     observed = labels_only.observations(scene, 0.0, np.random.default_rng(0))
     board = reference_board()
     for start in labels_only.models(scene, observed, unit_mm=37.0)[::3]:
@@ -80,6 +81,16 @@ def test_adjustments_are_exact_without_noise_and_find_the_eccentricity(scene, la
     for error in pose_errors(scene, target).values():
         assert np.abs(error[3:]).max() < 5e-4
         assert np.abs(error[:3]).max() < 5e-6
+    target, _ = labels_only.calibrate(scene, 0.01, 4)
+    options = RunOptions().settled(scene.target).adjustment(scene.target)
+    content = json.loads(json_text(FacesFile.of(target, scene.target, options, 1.25).content()))
+    for face_id in ("2", "3"):
+        along = np.array(content["target_from_face"][face_id])[:3, 3]
+        along = along / np.linalg.norm(along)
+        covariance = np.array(content["target_from_face_covariance"][face_id])[3:, 3:]
+        sigma = content["distance_sigma_mm"][f"1 {face_id}"]
+        assert sigma == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)
+    assert content["scale_sigma_ppm"] == pytest.approx(1e6 * target.scale_sigma)
 
 
 def test_only_what_contradicts_is_left_out_whatever_the_world_or_the_order_of_images(scene, labels_only):
@@ -213,20 +224,6 @@ def test_wrong_intrinsics_are_refined():
     assert held > 5 * known
 
 
-def test_sigma_of_a_distance_is_that_of_the_faces(scene, labels_only):
-    """From the reference, which is held, to another face: what the other's translation may do along the line."""
-    target, _ = labels_only.calibrate(scene, 0.01, 4)
-    options = RunOptions().settled(scene.target).adjustment(scene.target)
-    content = json.loads(json_text(FacesFile.of(target, scene.target, options, 1.25).content()))
-    for face_id in ("2", "3"):
-        along = np.array(content["target_from_face"][face_id])[:3, 3]
-        along = along / np.linalg.norm(along)
-        covariance = np.array(content["target_from_face_covariance"][face_id])[3:, 3:]
-        sigma = content["distance_sigma_mm"][f"1 {face_id}"]
-        assert sigma == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)
-    assert content["scale_sigma_ppm"] == pytest.approx(1e6 * target.scale_sigma)
-
-
 FLATNESS_MM = 0.02
 SIGMAS = np.array([1.5, 1.5, 1.0, 1.0, 5e-4, 2e-3, 5e-5, 5e-5])
 """Of fx, fy, cx, cy (px), k1, k2, p1, p2."""
@@ -251,21 +248,18 @@ def shift(case, changed, common) -> np.ndarray:
     return moved - free @ (free.T @ moved)
 
 
-@pytest.mark.parametrize(("refined", "common"), [(False, None), (True, None), (False, 0.6)])
-def test_the_parts_are_covariances_and_their_sum_is_the_adjustments_own(case, refined, common):
-    found = contributions_of(state_of(case, refined, common))
-    whole = found.joint.covariance_mm2
-    assert list(found.covariance_mm2) == list(OBSERVED)
-    absent = {PRINT, SIZES, DISTANCES} if refined else {PRINT, SIZES, DISTANCES, INTRINSICS}
-    for kind, part in found.covariance_mm2.items():
-        least, most = np.linalg.eigvalsh(part)[[0, -1]]
-        assert least > -1e-9 * np.abs(whole).max(), kind
-        assert (most > 1e-4 * np.abs(whole).max()) == (kind not in absent), kind
-    np.testing.assert_allclose(sum(found.covariance_mm2.values()), whole, atol=1e-7 * np.abs(whole).max())
-
-
-def test_what_the_sources_contribute_to_a_position_adds_up_as_squares(case):
-    """It is what :func:`contributions_of` has of each kind, in the face's own frame."""
+def test_the_parts_are_covariances_their_sum_the_adjustments_own_and_that_of_a_position(case):
+    """What :func:`contributions_of` has of each kind is that of a position in the face's own frame."""
+    for refined, common in ((False, None), (True, None), (False, 0.6)):
+        found = contributions_of(state_of(case, refined, common))
+        whole = found.joint.covariance_mm2
+        assert list(found.covariance_mm2) == list(OBSERVED)
+        absent = {PRINT, SIZES, DISTANCES} if refined else {PRINT, SIZES, DISTANCES, INTRINSICS}
+        for kind, part in found.covariance_mm2.items():
+            least, most = np.linalg.eigvalsh(part)[[0, -1]]
+            assert least > -1e-9 * np.abs(whole).max(), kind
+            assert (most > 1e-4 * np.abs(whole).max()) == (kind not in absent), kind
+        np.testing.assert_allclose(sum(found.covariance_mm2.values()), whole, atol=1e-7 * np.abs(whole).max())
     scene = case[1]
     state = state_of(case, refined=True)
     seen = {label.face for label in state.setting.labels}

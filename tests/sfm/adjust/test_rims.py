@@ -61,7 +61,7 @@ def test_no_rim_is_found_where_there_is_none(scene, look):
     assert rim_check(rims, 0.002, {}).verdict == "passed"
 
 
-def test_rims_that_harm_nothing_are_no_fault_and_need_the_joint_adjustment(scene):
+def test_rims_that_harm_nothing_are_no_fault_need_the_joint_adjustment_and_are_stated_by_designs(scene, tmp_path):
     """It is seen with certainty, and moves faces by less than their σ."""
     assert rim_check({}, 0.002, {}).verdict == "not possible"
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02, {}).verdict == "passed"
@@ -74,9 +74,6 @@ def test_rims_that_harm_nothing_are_no_fault_and_need_the_joint_adjustment(scene
         with fails_with(refusal):
             RunOptions(**options).settled(scene.target)
         assert RunOptions(rim=True).settled(scene.target).rim
-
-
-def test_designs_of_target_and_board_state_rims(scene, tmp_path):
     face = scene.target.faces[0]
     heights = np.where(np.arange(len(face.ids)) == 2, -0.1, 0.25)
     target = replace(scene.target, faces=(replace(face, rim_mm=heights), *scene.target.faces[1:]))

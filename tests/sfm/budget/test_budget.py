@@ -232,10 +232,18 @@ def test_a_size_of_the_target_itself_does_not_expand_and_without_one_nothing_in_
     refuses("E-BUDGET-NO-SIZE", against_stated, shape, tmp_path / "lengths.csv")
 
 
-def test_the_longest_distances_are_of_different_pairs_of_faces():
+def test_the_longest_distances_are_of_different_pairs_of_faces_and_lengths_that_are_none_refused(plain, tmp_path):
     labels = [CircleLabel(face, circle) for face in "12" for circle in "ab"]
     xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 5, 0], [0, 7, 0.0]])
     assert longest_of(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
+    for row, words in (
+        ("1:1,9:9,100,0", "E-BUDGET-LENGTHS … line 2: no circle 9:9"),
+        ("1:1,1:1,100,0", "E-BUDGET-LENGTHS … line 2: 1:1 to 1:1"),
+        ("1:1,1:2,40,-1", "E-BUDGET-LENGTHS … a σ of 0 or more"),
+        ("1:1,1:2,x,0", "E-TABLE-NUMBER … length_mm is 'x'"),
+    ):
+        (tmp_path / "lengths.csv").write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
+        refuses(words, against_stated, plain, tmp_path / "lengths.csv")
 
 
 def test_command(stcal_sfm, small_run, tmp_path, monkeypatch):
@@ -313,9 +321,8 @@ def test_a_changed_run_is_named_and_a_failed_check_is_said(stcal_sfm, small_run,
     assert "not judged: 1 lengths" in html
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
+def test_statements_that_are_none_are_refused_and_unusual_ones_asked_about(tmp_path):
+    for content, words in (
         ("[board]\npitch_sigma_ppm = 30e-6", "E-KEY-VALUE … 30, and in % 0.3;"),
         ("[board]\ntemperature_c = 295.65", "E-KEY-VALUE … 22.5 °C"),
         ("[board]\npitch_sigma_ppm = -1", "E-KEY-VALUE … board.pitch_sigma_ppm: -1:"),
@@ -324,28 +331,28 @@ def test_a_changed_run_is_named_and_a_failed_check_is_said(stcal_sfm, small_run,
         ("[fields]\noperator = 3", "E-KEY-VALUE … fields.operator: 3:"),
         ("operator = 'x'", "E-KEY-UNKNOWN … operator"),
         ("[target]\none_thermometer = true", "E-KEY-UNKNOWN … move it to the top of the file"),
-    ],
-)
-def test_statements_that_are_none(tmp_path, content, words):
-    (tmp_path / "lab.toml").write_text(content)
-    refuses(words, statement_of, StatedSize(), tmp_path / "lab.toml")
+    ):
+        (tmp_path / "lab.toml").write_text(content)
+        refuses(words, statement_of, StatedSize(), tmp_path / "lab.toml")
+
+    def asked(**values) -> list[str]:
+        return _unusual(Statement(StatedSize(**values), StatedSize(), {}, {}, False))
+
+    assert asked(temperature_c=23.0, temperature_sigma_k=0.5, expansion_ppm_per_k=70.0) == []
+    assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
+    assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
+    assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
+def test_options_that_are_none_and_a_chain_have_no_budget(stcal_sfm, small_run, tmp_path):
+    for words, said in (
         (("--field", "operator"), ("E-OPTION-VALUE",)),
         (("--field", "a=1", "--field", "a=2"), ("E-OPTION-REPEATED", "--field")),
         (("--lengths-statement", "x.toml"), ("E-OPTION-NEEDS", "--lengths")),
         (("--pdf",), ("E-OPTION-NEEDS", "--report", "FILE.html")),
         (("--report", "budget.pdf"), ("E-OUTPUT-SUFFIX", "budget.html, and --pdf")),
-    ],
-)
-def test_options_that_are_none(stcal_sfm, small_run, words, said):
-    assert_error(stcal_sfm("budget", small_run, *words), INPUT, *said)
-
-
-def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
+    ):
+        assert_error(stcal_sfm("budget", small_run, *words), INPUT, *said)
     copy = unsealed_copy(small_run, tmp_path / "run")
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
@@ -416,20 +423,6 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
     assert "hold at different temperatures" in mixed.notes[1]
 
 
-@pytest.mark.parametrize(
-    ("row", "words"),
-    [
-        ("1:1,9:9,100,0", "E-BUDGET-LENGTHS … line 2: no circle 9:9"),
-        ("1:1,1:1,100,0", "E-BUDGET-LENGTHS … line 2: 1:1 to 1:1"),
-        ("1:1,1:2,40,-1", "E-BUDGET-LENGTHS … a σ of 0 or more"),
-        ("1:1,1:2,x,0", "E-TABLE-NUMBER … length_mm is 'x'"),
-    ],
-)
-def test_lengths_that_are_none(plain, tmp_path, row, words):
-    (tmp_path / "lengths.csv").write_text(f"from,to,length_mm,sigma_mm\n{row}\n")
-    refuses(words, against_stated, plain, tmp_path / "lengths.csv")
-
-
 def test_uncertainties_have_two_significant_digits_and_values_end_with_the_last_of_them():
     shown = {14.26: "14", 9.96: "10", 0.01234: "0.012", 126.0: "130", None: "–"}
     assert {value: significant(value) for value in shown} == shown
@@ -484,16 +477,6 @@ def test_an_angle_is_that_of_the_normals_and_its_uncertainty_what_draws_of_the_c
         ]
         angles = np.arctan2(np.linalg.norm(np.cross(*normals), axis=1), np.sum(np.multiply(*normals), axis=1))
         assert np.std(angles) == pytest.approx(row.standard, rel=0.06)  # 4 σ of 2000 draws
-
-
-def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():
-    def asked(**values) -> list[str]:
-        return _unusual(Statement(StatedSize(**values), StatedSize(), {}, {}, False))
-
-    assert asked(temperature_c=23.0, temperature_sigma_k=0.5, expansion_ppm_per_k=70.0) == []
-    assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
-    assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
-    assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]
 
 
 @pytest.mark.parametrize("of", ["many points", "edge on", "one plane"])

@@ -141,7 +141,8 @@ def test_without_noise_the_centre_is_the_ideal_ellipses_centre(circles, how, mos
     np.testing.assert_array_equal(of_16_bits.centre_px, found.centre_px)
 
 
-def test_a_circle_partly_hidden_is_not_measured_and_none_of_none():
+def test_circles_partly_hidden_are_not_measured_and_others_together_as_each_alone():
+    """Single precision: 1e-5 px. Each pattern has its own factor for what correlates the pixels."""
     image = draw(CAMERA, CIRCLES[:2])
     start = start_from(CAMERA, CIRCLES[:2])
     x, y = start.centre_px[0].astype(int)
@@ -151,10 +152,6 @@ def test_a_circle_partly_hidden_is_not_measured_and_none_of_none():
     assert found.rim[0] < 0.8
     assert found.ok[1]
     assert len(measure_centres(image, CAMERA, start.select([]), start.select([]))) == 0
-
-
-def test_circles_are_measured_together_as_each_alone():
-    """Single precision: 1e-5 px. Each pattern has its own factor for what correlates the pixels."""
     image, start = draw(CAMERA, CIRCLES), start_from(CAMERA, CIRCLES)
     image = np.clip(image + np.random.default_rng(3).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
     groups = np.array([0, 0, 1, 1])

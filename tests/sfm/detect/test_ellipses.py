@@ -29,19 +29,16 @@ def add_ellipse(image, centre, axes, angle=0.0, value=200):
     return image
 
 
-@pytest.mark.parametrize("polarity", ["bright", "dark"])
-@pytest.mark.parametrize("diameter", [8, 40, 400])
-def test_every_size_is_found(polarity, diameter):
-    level, value = (40, 200) if polarity == "bright" else (200, 40)
-    image = add_ellipse(picture(level=level), (600, 450), (diameter / 2, diameter / 2), value=value)
-    found = find_ellipses(cv2.GaussianBlur(image, (3, 3), 0.8), polarity, EllipseOptions())
-    assert len(found) == 1
-    assert np.linalg.norm(found.centre_px[0] - [600, 450]) < 0.02 * diameter + 1
-    assert found.radius_px()[0] == pytest.approx(diameter / 2, rel=0.1, abs=0.8)
-    assert found.contrast[0] == pytest.approx(160, abs=40)
-
-
-def test_a_tilted_circle_keeps_its_shape_size_limits_are_kept_and_faint_blobs_left_out():
+def test_circles_of_every_size_and_tilt_are_found_but_beyond_limits_and_faint_blobs():
+    for polarity in ("bright", "dark"):
+        for diameter in (8, 40, 400):
+            level, value = (40, 200) if polarity == "bright" else (200, 40)
+            image = add_ellipse(picture(level=level), (600, 450), (diameter / 2, diameter / 2), value=value)
+            found = find_ellipses(cv2.GaussianBlur(image, (3, 3), 0.8), polarity, EllipseOptions())
+            assert len(found) == 1
+            assert np.linalg.norm(found.centre_px[0] - [600, 450]) < 0.02 * diameter + 1
+            assert found.radius_px()[0] == pytest.approx(diameter / 2, rel=0.1, abs=0.8)
+            assert found.contrast[0] == pytest.approx(160, abs=40)
     for tilt_deg in (30, 70):
         image = add_ellipse(picture(), (600, 450), (30, 30 * np.cos(np.radians(tilt_deg))), angle=35)
         found = find_ellipses(image, "bright", EllipseOptions())

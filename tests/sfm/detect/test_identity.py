@@ -70,18 +70,15 @@ def found_in(ellipses, target=TARGET):
     return find_faces(Candidates(ellipses, CAMERA), target)
 
 
-@pytest.mark.parametrize("face_id", ["1", "2", "3", "4", "5"])
-@pytest.mark.parametrize(("tilt", "azimuth", "roll"), [(0, 0, 0), (68, 200, 250)])
-def test_every_face_is_named_at_any_tilt(face_id, tilt, azimuth, roll):
-    (found,), _ = found_in(face_ellipses(face_id, pose(tilt, azimuth, roll)))
-    assert found.face == face_id
-    assert found.rows.tolist() == found.circles.tolist() == list(range(10))
-
-
-def test_which_circles_a_face_needs_for_its_name():
+def test_every_face_is_named_at_any_tilt_by_enough_of_its_circles():
     """Six circles are left at least: four make a homography, two confirm it, and nothing else reads like them. One
     twice as large as designed is left out, of circles of 20 px, where the outline's error is a hundredth of it. Nothing
     is named without the circle that tells the faces apart or five others, nor by a design without faces."""
+    for face_id in ("1", "2", "3", "4", "5"):
+        for tilt, azimuth, roll in ((0, 0, 0), (68, 200, 250)):
+            (found,), _ = found_in(face_ellipses(face_id, pose(tilt, azimuth, roll)))
+            assert found.face == face_id
+            assert found.rows.tolist() == found.circles.tolist() == list(range(10))
     for hidden in ("1", "a", "126", "457b"):
         (found,), _ = found_in(face_ellipses("4", pose(50, 120, 30), hidden))
         assert found.face == "4"
@@ -97,13 +94,19 @@ def test_which_circles_a_face_needs_for_its_name():
     assert found_in(face_ellipses("1", pose()), TargetDesign("none", "bright", ())) == ([], [])
 
 
-@pytest.mark.parametrize(("dots", "repeated"), [(63, True), (51, True), (50, False)])
-def test_a_second_board_counts_if_it_is_of_similar_size(dots, repeated):
-    cells = np.array([[r, c] for r in range(7) for c in range(9)])
-    boards = [BoardSighting(np.arange(n), cells[None, :n]) for n in (63, dots)]
-    found = ImageDetection(centres_of(np.zeros((0, 2)), np.zeros((0, 2))), (), tuple(boards))
-    assert found.repeated == (("board",) if repeated else ())
-    assert (found.board is None) == repeated
+def test_a_second_board_counts_if_it_is_of_similar_size_and_a_printed_grid_of_equal_discs_is_no_face():
+    """Between the large and the small circles' radius, equal discs are of neither size by less than 1.45."""
+    for dots, repeated in ((63, True), (51, True), (50, False)):
+        cells = np.array([[r, c] for r in range(7) for c in range(9)])
+        boards = [BoardSighting(np.arange(n), cells[None, :n]) for n in (63, dots)]
+        found = ImageDetection(centres_of(np.zeros((0, 2)), np.zeros((0, 2))), (), tuple(boards))
+        assert found.repeated == (("board",) if repeated else ())
+        assert (found.board is None) == repeated
+    for radius in (4.0, 5.66, 8.0):
+        grid = np.array([[x, y] for x in range(0, 120, 20) for y in range(0, 120, 20)], float)
+        assert found_in(ellipses_of(pose(20, 10, 30), grid, np.full(len(grid), radius)))[0] == []
+        own = TARGET.face("5")
+        assert found_in(ellipses_of(pose(20, 10, 30), own.xy_mm, np.full(10, radius)))[0] == []
 
 
 def test_faces_of_any_light_number_and_circles_are_found_together_but_one_that_looks_the_same_turned(monkeypatch):
@@ -125,15 +128,6 @@ def test_faces_of_any_light_number_and_circles_are_found_together_but_one_that_l
     square = FaceDesign("s", tuple("abcdef"), xy, [5.0] * 6, "a", "c", "d")
     target = TargetDesign("symmetric", "bright", (square,))
     assert found_in(ellipses_of(pose(), square.xy_mm, square.radius_mm), target)[0] == []
-
-
-@pytest.mark.parametrize("radius", [4.0, 5.66, 8.0])
-def test_a_printed_grid_of_equal_discs_is_no_face(radius):
-    """Between the large and the small circles' radius, equal discs are of neither size by less than 1.45."""
-    grid = np.array([[x, y] for x in range(0, 120, 20) for y in range(0, 120, 20)], float)
-    assert found_in(ellipses_of(pose(20, 10, 30), grid, np.full(len(grid), radius)))[0] == []
-    own = TARGET.face("5")
-    assert found_in(ellipses_of(pose(20, 10, 30), own.xy_mm, np.full(10, radius)))[0] == []
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def test_circles_are_seen_well_and_keep_apart(made):
         assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
 
 
-def test_faces_lie_on_the_box():
+def test_faces_lie_on_the_box_some_sides_alone_have_circles_and_sizes_are_three_lengths():
     """Plates' corners are corners of the box, shared by three faces but for those below; normals point outwards."""
     corners = []
     for face in make_pattern(sides_of(SIZE), LEAST_CIRCLES, 4.0, "dark", 0, "box")[0].faces:
@@ -111,6 +111,15 @@ def test_faces_lie_on_the_box():
     box = {(x, y, z) for x in (-w / 2, w / 2) for y in (-d / 2, d / 2) for z in (-h / 2, h / 2)}
     assert set(counts) == box
     assert all(n == (3 if z > 0 else 2) for (_, _, z), n in counts.items())
+    assert faces_of("") == NAMES
+    names = faces_of("top, front")
+    assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
+    every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
+    for side in sides_of(SIZE, names):
+        np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
+    for size in ("130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"):
+        with pytest.raises(InputError, match="--size"):
+            DesignOptions(size_of(size))
 
 
 @pytest.mark.parametrize(
@@ -128,18 +137,6 @@ def test_faces_lie_on_the_box():
 )
 def test_what_cannot_be_made_is_refused(options, said):
     refuses(said, lambda: make_target(DesignOptions(SIZE, **options)))
-
-
-def test_some_sides_alone_have_circles_and_sizes_are_three_lengths():
-    assert faces_of("") == NAMES
-    names = faces_of("top, front")
-    assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
-    every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
-    for side in sides_of(SIZE, names):
-        np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
-    for size in ("130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"):
-        with pytest.raises(InputError, match="--size"):
-            DesignOptions(size_of(size))
 
 
 def test_outlines_at_any_angle_are_taken_and_those_that_do_not_fit_refused(tmp_path):

@@ -207,7 +207,7 @@ def test_stated_intrinsics_go_into_the_covariance(scene, known):
     assert np.mean(held) > 3
 
 
-def test_too_few_circles_and_wrong_labels(scene, known):
+def test_too_few_circles_wrong_labels_and_other_joints_are_refused(scene, known, tmp_path):
     _, _, image = one_view(scene, np.random.default_rng(11), ("2",), NOISE_PX, (20, 40), (900, 1000))
     for count in (0, 1, 3):
         few = image.select(list(range(count)))
@@ -226,9 +226,19 @@ def test_too_few_circles_and_wrong_labels(scene, known):
         pose_from_circles(mixed, known.truth, scene.camera)
     with fails_with("E-COVARIANCE-VALUE … 0"):
         pose_from_circles(replace(image, covariance_px2=0 * image.covariance_px2), known.truth, scene.camera)
+    for text, code in (
+        ("image,x_mm\na.jpg,1\n", "E-TABLE-COLUMNS-CONFLICT … x_mm"),
+        ("image,q1_deg\nb.jpg,1\n", "E-IMAGES-UNMATCHED … a.jpg"),
+        ("image,q1_deg\na.jpg,1\na.jpg,2\n", "E-TABLE-ROW-REPEATED … a.jpg"),
+    ):
+        _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
+        result = measured_from([replace(image, name="a.jpg")], scene.camera, known.truth)
+        (tmp_path / "joints.csv").write_text(text)
+        with fails_with(code):
+            poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
 
 
-def test_faces_json_holds_the_covariance_of_all_circles_together(small_run, tmp_path):
+def test_faces_json_holds_the_covariance_of_all_circles_and_one_of_another_target_is_refused(small_run, tmp_path):
     """Its blocks are the 3×3 that are there too; the reference face's origin has no error in its own plane. What an
     older file lacks is said."""
     content = json.loads((small_run / "faces.json").read_text())
@@ -250,6 +260,17 @@ def test_faces_json_holds_the_covariance_of_all_circles_together(small_run, tmp_
     assert any("covariances between circles" in note for note in target.notes)
     assert any("no centre_sigma_factor" in note for note in target.notes)
     assert np.abs(target.covariance[:3, 3:]).max() == 0 < np.trace(target.covariance)
+    for change, message in (
+        (other_circle, r"circle 7:1 is not in target"),
+        (lambda content: less(content["circles"]["2:7"], -5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
+        (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
+        (
+            lambda content: less(content["circles_joint_covariance_mm2"]["upper_triangle"], 1.0),
+            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_spoilt(small_run, tmp_path, change)
 
 
 def command(small_dataset, small_run, tmp_path, *more, faces=None):
@@ -311,39 +332,6 @@ def other_circle(content):
         content[key]["7:1"] = content[key].pop("1:1")
     labels = content["circles_joint_covariance_mm2"]["labels"]
     labels[labels.index("1:1")] = "7:1"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (other_circle, r"circle 7:1 is not in target"),
-        (lambda content: less(content["circles"]["2:7"], -5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
-        (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
-        (
-            lambda content: less(content["circles_joint_covariance_mm2"]["upper_triangle"], 1.0),
-            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
-        ),
-    ],
-)
-def test_faces_of_another_target_are_refused(small_run, tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
-        read_spoilt(small_run, tmp_path, change)
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("image,x_mm\na.jpg,1\n", "E-TABLE-COLUMNS-CONFLICT … x_mm"),
-        ("image,q1_deg\nb.jpg,1\n", "E-IMAGES-UNMATCHED … a.jpg"),
-        ("image,q1_deg\na.jpg,1\na.jpg,2\n", "E-TABLE-ROW-REPEATED … a.jpg"),
-    ],
-)
-def test_other_joints_are_refused(scene, known, tmp_path, text, code):
-    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    result = measured_from([replace(image, name="a.jpg")], scene.camera, known.truth)
-    (tmp_path / "joints.csv").write_text(text)
-    with fails_with(code):
-        poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
 
 
 def test_faces_that_are_not_calibrated_and_mistakes_in_the_camera_file_are_said(scene, known):

@@ -122,8 +122,9 @@ def test_images_are_worth_their_root_unless_the_board_dominates_and_scale_is_as_
     assert forecast(models_of(exact, CentreNoise(1e-3)), setup).scale_sigma == pytest.approx(expected, rel=0.02)
 
 
-def test_centre_noise_of_a_disc_is_its_cramer_rao_bound_and_found_again(exact):
-    """Fisher's information of a blurred disc, summed over pixels."""
+def test_centre_noise_is_a_cramer_rao_bound_found_again_and_what_a_rim_tells_the_integral_around_it(exact):
+    """Fisher's information of a blurred disc, summed over pixels. A rim against a polygon of 4096 sides, which errs by
+    (π/4096)²/6, a part in ten million."""
     radius, step = 15.0, 1e-3
     y, x = np.mgrid[-30:31, -30:31]
 
@@ -136,27 +137,23 @@ def test_centre_noise_of_a_disc_is_its_cramer_rao_bound_and_found_again(exact):
     radius = exact.target.radius_of() | exact.board.radius_of()
     found = CentreNoise.measured(models_of(exact), exact.camera, radius)
     assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
-
-
-@pytest.mark.parametrize("tilt_deg", [0.0, 76.0])
-def test_what_a_rim_tells_is_the_integral_around_it(tilt_deg):
-    """Against a polygon of 4096 sides, which errs by (π/4096)²/6, a part in ten million."""
-    camera = Camera(4000, 3000, [3000.0, 3000.0], [2000.0, 1500.0], np.zeros(8))
-    turn = Rigid.exp([np.radians(tilt_deg), 0, 0, 0, 0, 0]).rotation
-    angle = 2 * np.pi * np.arange(4096) / 4096
-    xyz = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4096)])
-    rim = 3000.0 * 1e-3 * (xyz @ turn.T)[:, :2]
-    side = np.roll(rim, -1, axis=0) - rim
-    across = np.column_stack([side[:, 1], -side[:, 0]]) / np.sqrt(np.linalg.norm(side, axis=1))[:, None]
-    labels = tuple(CircleLabel("1", str(i)) for i in range(4))
-    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * 1e-3 @ turn.T
-    one = np.zeros(4, int)
-    model = MetricModel(
-        "1", ("a",), (Rigid(np.eye(3), [0.0, 0, 1000]),), labels, places, one, np.arange(4), np.arange(4),
-        np.zeros((4, 2)), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)),
-    )  # fmt: skip
-    found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
-    np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
+    for tilt_deg in (0.0, 76.0):
+        camera = Camera(4000, 3000, [3000.0, 3000.0], [2000.0, 1500.0], np.zeros(8))
+        turn = Rigid.exp([np.radians(tilt_deg), 0, 0, 0, 0, 0]).rotation
+        angle = 2 * np.pi * np.arange(4096) / 4096
+        xyz = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4096)])
+        rim = 3000.0 * 1e-3 * (xyz @ turn.T)[:, :2]
+        side = np.roll(rim, -1, axis=0) - rim
+        across = np.column_stack([side[:, 1], -side[:, 0]]) / np.sqrt(np.linalg.norm(side, axis=1))[:, None]
+        labels = tuple(CircleLabel("1", str(i)) for i in range(4))
+        places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * 1e-3 @ turn.T
+        one = np.zeros(4, int)
+        model = MetricModel(
+            "1", ("a",), (Rigid(np.eye(3), [0.0, 0, 1000]),), labels, places, one, np.arange(4), np.arange(4),
+            np.zeros((4, 2)), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)),
+        )  # fmt: skip
+        found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
+        np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
 
 
 def known_from(scene: Scene) -> KnownRun:
@@ -277,7 +274,8 @@ def test_a_candidate_shows_nothing_that_is_hidden(known, coarse):
             assert max(view.tilts_deg.values()) < 75
 
 
-def test_advise_of_a_run_starts_from_its_own_sigma_and_says_where_it_is_not_to_be_trusted(small_run):
+def test_advice_starts_from_a_runs_own_sigma_with_estimated_rims_and_says_where_it_is_not_to_be_trusted(small_run):
+    """No view lowers that of rims: each face lies half of an error of the height along its own normal."""
     known = known_of(saved := load_run(small_run))
     now = forecast(known.models, known.setup)
     stated = json.loads((small_run / "faces.json").read_text())["target_from_face_covariance"]
@@ -289,23 +287,6 @@ def test_advise_of_a_run_starts_from_its_own_sigma_and_says_where_it_is_not_to_b
     control = replace(saved, options=replace(saved.options, eccentricity=False))
     assert "uncorrected control" in doubts(control)
     assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
-
-
-def test_a_plan_takes_a_camera_as_its_file_that_states_its_size():
-    camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
-    target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
-    for given in (camera, model_of(camera)):
-        options = PlanOptions(images=2, camera=given, groups=(("1", "2"),))
-        assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
-        near = PlanOptions(images=20, distance_mm=300.0, camera=given)
-        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
-    with fails_with("E-CAMERA-SIZE"):
-        PlanOptions(camera=camera)
-
-
-def test_advice_holds_the_sigma_of_estimated_rims(small_run):
-    """No view lowers it: each face lies half of an error of the height along its own normal."""
     saved = load_run(small_run)
     faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
     summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
@@ -329,6 +310,19 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
         assert shares[face]["rims"] == pytest.approx(added / np.trace(covariance[3:, 3:]), rel=0.01)
         assert sum(shares[face].values()) == pytest.approx(1, abs=1e-3)
         assert np.sqrt(further[face] ** 2 - further_seen[face] ** 2) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_plan_takes_a_camera_as_its_file_that_states_its_size():
+    camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
+    target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
+    for given in (camera, model_of(camera)):
+        options = PlanOptions(images=2, camera=given, groups=(("1", "2"),))
+        assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
+        near = PlanOptions(images=20, distance_mm=300.0, camera=given)
+        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
+    with fails_with("E-CAMERA-SIZE"):
+        PlanOptions(camera=camera)
 
 
 def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):

@@ -3,8 +3,6 @@
 import copy
 import re
 
-import pytest
-
 from stcal.errors import MappingError
 from stcal.sfm.data.group_model import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
@@ -42,7 +40,7 @@ def report(*checks: dict, source: str = "board", share: float = 0.36, **sigma_um
     return made
 
 
-def test_all_is_well():
+def test_all_is_well_or_what_makes_sigma_larger_is_named_in_the_words_of_a_photographer():
     found = judgement_of(report(f3=[3.04, 1.0, 1.0]))
     assert (found.verdict, found.use) == ("yes", "Yes: 17 checks passed.")
     assert (found.position_face, found.position_sigma_um) == ("3", 3.04)
@@ -51,44 +49,35 @@ def test_all_is_well():
     assert "2.0 ppm" in found.quality
     assert "64 % of the variance of face 3 along x (σ 3.0 µm)" in found.limit
     assert "2.2 of 3.0 µm" in found.next  # √(0.36 + 0.64/4) · 3.04
-
-
-@pytest.mark.parametrize("name", ["number", "distance", "angles", "blur", "light"])
-def test_what_makes_sigma_larger_is_named_in_the_words_of_a_photographer(name):
-    good = dict.fromkeys(["number", "distance", "angles", "blur", "light"], (7.3, 1.1))
-    found = judgement_of(report() | {"conditions": good})
-    assert found.limit.startswith("Number alone: distance, angles, blur, light are good. The centring of circles")
-    assert found.next.startswith("Nothing has to be done; four times the images")
-    found = judgement_of(report() | {"conditions": good | {name: (7.3, 2.04)}})
-    assert found.limit.startswith(f"{name.capitalize()}: ")
-    assert "; σ are up to 2.0 times larger. The centring of circles" in found.limit
-    assert found.next.startswith("Nothing has to be done. To be better, ")
-    found = judgement_of(report() | {"conditions": good | {name: (7.3, 8.0)}})
-    assert "Nothing has to be done" not in found.next
-    assert ". Or four times the images" in found.next
+    for name in ("number", "distance", "angles", "blur", "light"):
+        good = dict.fromkeys(["number", "distance", "angles", "blur", "light"], (7.3, 1.1))
+        found = judgement_of(report() | {"conditions": good})
+        assert found.limit.startswith("Number alone: distance, angles, blur, light are good. The centring of circles")
+        assert found.next.startswith("Nothing has to be done; four times the images")
+        found = judgement_of(report() | {"conditions": good | {name: (7.3, 2.04)}})
+        assert found.limit.startswith(f"{name.capitalize()}: ")
+        assert "; σ are up to 2.0 times larger. The centring of circles" in found.limit
+        assert found.next.startswith("Nothing has to be done. To be better, ")
+        found = judgement_of(report() | {"conditions": good | {name: (7.3, 8.0)}})
+        assert "Nothing has to be done" not in found.next
+        assert ". Or four times the images" in found.next
 
 
 WHOLE_SET = check(CAUSE, "failed", remedy="look") | {"title": OF_WHOLE_SET + "Check b"}
 
 
-@pytest.mark.parametrize(
-    ("others", "count"),
-    [
+def test_a_failed_check_forbids_the_use_and_a_suspicious_one_says_how_often_chance_makes_it():
+    for others, count in (
         ((check("a", "suspicious"), check("b", "failed", remedy="look"), check("c", "passed")), "1 of 3"),
-        # One that names an image comes first, one that does not tell what is wrong last, the cause of all before all.
+        # One that names an image comes first, one that does not tell what is wrong last, the cause of all before.
         ((check("a", "failed", ("face 2",)), check("b", "failed", ("a/1.jpg",), "look")), "2 of 2"),
         ((check("agreement", "failed", ("all",)), check("b", "failed", (), "look")), "2 of 2"),
         ((check("moved", "failed", ("a/1.jpg",), "wait"), check("c", "passed"), WHOLE_SET), "1 of 2"),
-    ],
-)
-def test_a_failed_check_forbids_the_use_and_the_remedy_of_the_first_is_next(others, count):
-    found = judgement_of(report(*others))
-    assert (found.verdict, found.next) == ("no", "Look.")
-    assert count in found.use
-    assert "Check b" in found.use
-
-
-def test_a_suspicious_check_says_how_often_chance_makes_one():
+    ):
+        found = judgement_of(report(*others))
+        assert (found.verdict, found.next) == ("no", "Look.")
+        assert count in found.use
+        assert "Check b" in found.use
     others = [check(f"c{i}", "passed") for i in range(16)]
     found = judgement_of(report(check("a", "suspicious", remedy="repeat it"), *others, check("d", "not possible")))
     assert found.verdict == "with care"
@@ -118,40 +107,31 @@ def test_the_face_that_stands_out_limits_else_the_largest_share():
     assert judgement_of(report(share=0.49)).limit.startswith("The centring")
 
 
-@pytest.mark.parametrize(
-    ("source", "edge_share", "words", "not_said"),
-    [
+def test_each_source_has_its_own_remedy_and_some_results_are_not_without_care():
+    """A σ of the edges of tags becomes no smaller by what is stated of the print."""
+    for source, edge_share, words, not_said in (
         ("sizes", 0.6, "[[scale]]", "size_sigma_mm"),
         ("sizes", 0.1, "size_sigma_mm", "edges"),
         ("distances", None, "a longer one", "size_sigma_mm"),
         ("intrinsics", None, "calibrate-camera", "[[scale]]"),
-    ],
-)
-def test_each_source_has_its_own_remedy(source, edge_share, words, not_said):
-    """A σ of the edges of tags becomes no smaller by what is stated of the print."""
-    own = report(source=source, share=0.8)
-    own["summary"]["edge_share"] = edge_share
-    found = judgement_of(own)
-    assert "80 % of the variance of face 4 along x (σ 2.0 µm)" in found.limit
-    assert words in found.next
-    assert not_said not in found.next
-
-
-@pytest.mark.parametrize(
-    ("own", "verdict", "part", "words"),
-    [
+    ):
+        own = report(source=source, share=0.8)
+        own["summary"]["edge_share"] = edge_share
+        found = judgement_of(own)
+        assert "80 % of the variance of face 4 along x (σ 2.0 µm)" in found.limit
+        assert words in found.next
+        assert not_said not in found.next
+    for own, verdict, part, words in (
         (report() | {"options": {"solve": "paper", "eccentricity": False}}, "no", "next", "--solve paper"),
         (report() | {"options": {"solve": "chain", "eccentricity": False}}, "no", "next", "--no-eccentricity"),
         (make(sigma=False), "with care", "next", "--solve joint"),
         (report() | {"crosscheck": {"differences": ["face 2 is off"]}}, "with care", "limit", "COLMAP differs: face 2"),
         # The dots of the board tell it where groups are lost.
         (report(check(CAUSE, "failed"), check("camera", "passed")), "no", "use", "Check cause"),
-    ],
-)
-def test_results_that_are_for_comparison_or_not_without_care(own, verdict, part, words):
-    found = judgement_of(own)
-    assert found.verdict == verdict
-    assert words in getattr(found, part)
+    ):
+        found = judgement_of(own)
+        assert found.verdict == verdict
+        assert words in getattr(found, part)
 
 
 def test_the_board_alone_one_face_and_what_is_missing():

@@ -191,25 +191,24 @@ def rows_of(page: str, section: str) -> list[list[str]]:
     ]
 
 
-@pytest.mark.parametrize("kind", ["joint", "chained"])
-def test_the_page_is_whole_and_stands_alone(kind, request):
-    page = request.getfixturevalue(kind)
-    parsed = Page(page)
-    assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
-    assert len(parsed.ids) == len(set(parsed.ids))
-    inside = [r for r in parsed.references if r.startswith("#")]
-    embedded = [r for r in parsed.references if r.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,"))]
-    assert sorted(inside + embedded) == sorted(parsed.references)
-    assert {r[1:] for r in inside} <= set(parsed.ids)
-    assert {"link", "iframe", "object"}.isdisjoint(parsed.tags)
-    assert not re.search(r"url\(|@import|https?:", page)
-    assert re.findall(r"<script[^>]*>", page) == ['<script type="application/json">', "<script>"]  # scene, and ours
-    assert "alert(" not in "".join(re.findall(r"<script>(.*?)</script>", page, re.DOTALL))
-    assert NASTY in parsed.text
-    assert "target <one>" in parsed.text
-
-
-def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
+def test_the_page_is_whole_stands_alone_and_embeds_its_pictures(request, joint):
+    for kind in ("joint", "chained"):
+        page = request.getfixturevalue(kind)
+        parsed = Page(page)
+        assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
+        assert len(parsed.ids) == len(set(parsed.ids))
+        inside = [r for r in parsed.references if r.startswith("#")]
+        embedded = [
+            r for r in parsed.references if r.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,"))
+        ]
+        assert sorted(inside + embedded) == sorted(parsed.references)
+        assert {r[1:] for r in inside} <= set(parsed.ids)
+        assert {"link", "iframe", "object"}.isdisjoint(parsed.tags)
+        assert not re.search(r"url\(|@import|https?:", page)
+        assert re.findall(r"<script[^>]*>", page) == ['<script type="application/json">', "<script>"]  # scene, and ours
+        assert "alert(" not in "".join(re.findall(r"<script>(.*?)</script>", page, re.DOTALL))
+        assert NASTY in parsed.text
+        assert "target <one>" in parsed.text
     plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
     assert len(plots) == 2  # board of the one group, and photographs
     for plot in plots:
@@ -269,7 +268,7 @@ def words(drawing) -> list[str]:
     return re.findall(r">([^<]+)</text>", drawing.svg())
 
 
-def test_residuals_over_their_sigma_are_of_a_normal_distribution(small_result, monkeypatch):
+def test_residuals_over_their_sigma_are_of_a_normal_distribution_and_figures_have_limits(small_result, monkeypatch):
     """As in any adjustment with true σ. Circles that both groups show are counted as unknown in each, which makes the
     share of the redundancy smaller by up to a sixth, and the spread larger by up to a twelfth."""
     run, drawn = small_result.out, []
@@ -279,10 +278,6 @@ def test_residuals_over_their_sigma_are_of_a_normal_distribution(small_result, m
     assert np.std(values) == pytest.approx(1.04, abs=0.06)
     assert abs(np.corrcoef(values.T)[0, 1]) < 0.1
     assert f"{values.size} coordinates, " in " ".join(words(normalised_residuals(values.ravel())))
-
-
-def test_figures_of_residuals_name_cells_photographs_and_limits():
-    """Twenty in one cell and four, too few to be drawn, in another."""
     one = np.tile([110.0, 70.0, 0.02, 0.0], (20, 1))
     seen = words(residual_field(np.vstack([one, np.tile([1000.0, 70.0, 5.0, 0.0], (4, 1))]), (1200, 800)))
     assert "20" in seen

@@ -48,7 +48,8 @@ class Here(Executor):
         return future
 
 
-def test_jobs_go_to_an_executor_a_few_at_a_time_with_paths_from_the_root(tmp_path, monkeypatch):
+def test_jobs_go_to_an_executor_a_few_at_a_time_and_processes_that_end_are_one_line(tmp_path, monkeypatch):
+    """Paths go to workers from the root; folders that they do not see are one line, too."""
     with ThreadPoolExecutor(3) as pool:
         found = dict(hand_over(pool, pow, [(i, 2) for i in range(50)], 4))
     assert found == {i: i * i for i in range(50)}
@@ -57,19 +58,16 @@ def test_jobs_go_to_an_executor_a_few_at_a_time_with_paths_from_the_root(tmp_pat
         assert dict(run_on_images(lambda file: file.path, [(ImageFile(Path("a.jpg"), "a.jpg", "."),)])) == {
             0: tmp_path / "a.jpg"
         }
-
-
-def end(_):
-    """As a process ends that takes more memory than there is."""
-    os._exit(1)
-
-
-def test_processes_that_end_and_folders_that_workers_do_not_see_are_one_line(tmp_path):
     with fails_with("E-WORKER-DIED … 2"):
         dict(run_on_images(end, [(1,), (2,)], 2))
     file = ImageFile(tmp_path / "elsewhere" / "a.jpg", "a.jpg", ".")
     with spread(Here(), 3), fails_with("E-WORKER-PATH … elsewhere … --send-images"):
         dict(run_on_images(len, [(file,)]))
+
+
+def end(_):
+    """As a process ends that takes more memory than there is."""
+    os._exit(1)
 
 
 @pytest.mark.slow

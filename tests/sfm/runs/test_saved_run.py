@@ -328,7 +328,7 @@ def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own_run, stcal_sfm, n
     assert (own_run / "report.html").read_bytes() == before
 
 
-def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run):
+def test_terminal_file_and_page_have_the_same_judgement_and_residuals(small_result, small_run):
     stored = Judgement.model_validate(json.loads((small_run / "report.json").read_text())["judgement"])
     assert stored == small_result.judgement
     page, terminal = (small_run / "report.html").read_text(), " ".join(run_text(small_result).split())
@@ -336,9 +336,6 @@ def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run)
     for question, answer in stored.answers():
         assert f"{question} {answer}" in terminal
         assert f"<dt>{question}</dt><dd>{with_code(answer)}</dd>" in page
-
-
-def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_run):
     report = json.loads((small_run / "report.json").read_text())
     with open(small_run / "labels.csv", encoding="utf-8", newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["residual_x_px"]]

@@ -47,22 +47,19 @@ def content(out):
 NEW = {"faces.json": "new", "report.json": "new", "colmap": "new", "overlays/12/a.jpg": "new"}
 
 
-def test_new_results_take_the_earlier_ones_place(tmp_path):
-    make(tmp_path / "run", "old", names=("faces.json", "labels.csv", "compare.json"))
-    (tmp_path / "run" / "notes.txt").write_text("mine")
-    make(tmp_path / "run", "new")
-    assert content(tmp_path / "run") == NEW | {"notes.txt": "mine"}
-    assert json.loads((tmp_path / "run" / RUN_MARKER).read_text())["program"] == "stcal-sfm"
-
-
-@pytest.mark.parametrize("names", [("faces.json", "report.json"), ("detections.csv",)])
-def test_a_run_that_fails_leaves_the_earlier_results(tmp_path, names):
-    make(tmp_path / "run", "old", names=names)
-    before = content(tmp_path / "run")
-    with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay"):
-        fail(tmp_path / "run")
-    assert content(tmp_path / "run") == before
-    assert verify(tmp_path / "run").notes() == []
+def test_new_results_take_the_earlier_ones_place_and_a_run_that_fails_leaves_them(tmp_path):
+    out = tmp_path / "run"
+    for names in (("faces.json", "report.json"), ("detections.csv",), ("faces.json", "labels.csv", "compare.json")):
+        make(out, "old", names=names)
+        before = content(out)
+        with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay"):
+            fail(out)
+        assert content(out) == before
+        assert verify(out).notes() == []
+    (out / "notes.txt").write_text("mine")
+    make(out, "new")
+    assert content(out) == NEW | {"notes.txt": "mine"}
+    assert json.loads((out / RUN_MARKER).read_text())["program"] == "stcal-sfm"
 
 
 @pytest.mark.parametrize("names", [("detections.csv",), ("detections.csv", "faces.json", "colmap")])
@@ -98,32 +95,24 @@ def ended_at(moment, monkeypatch, write_results):
 
 
 @pytest.mark.parametrize("moment", range(len(NEW) + 3))
-def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
-    """Killed at each of the renames: what is opened next is whole, and the new one's."""
-    out = tmp_path / "run"
-    make(out, "old", names=("faces.json", "labels.csv", "compare.json"))
-    before = content(out)
-    ended_at(moment, monkeypatch, lambda: make(out, "new"))
-    complete_interrupted(out)
-    assert content(out) == (NEW if moment else before)
-    assert verify(out).notes() == []
-
-
-@pytest.mark.parametrize("moment", range(4))
-def test_an_addition_that_is_killed_is_completed_and_takes_nothing_away(tmp_path, moment, monkeypatch):
-    out = tmp_path / "run"
-    make(out, "old", names=("faces.json", "report.html", "report.pdf"))
-    before = content(out)
+def test_what_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
+    """A run and an addition, killed at each of the renames: what is opened next is whole, and the new one's. An
+    addition takes nothing away."""
+    run, own = tmp_path / "run", tmp_path / "own"
+    make(run, "old", names=("faces.json", "labels.csv", "compare.json"))
+    make(own, "old", names=("faces.json", "report.html", "report.pdf"))
 
     def add():
-        with added_results(out) as stage:
+        with added_results(own) as stage:
             (stage / "report.html").write_text("added")
 
-    ended_at(moment, monkeypatch, add)
-    complete_interrupted(out)
-    added = {name: text for name, text in before.items() if name != "report.pdf"} | {"report.html": "added"}
-    assert content(out) == (added if moment else before)
-    assert verify(out).notes() == []
+    added = {name: text for name, text in content(own).items() if name != "report.pdf"} | {"report.html": "added"}
+    for out, write_results, new in ((run, lambda: make(run, "new"), NEW), (own, add, added)):
+        before = content(out)
+        ended_at(moment, monkeypatch, write_results)
+        complete_interrupted(out)
+        assert content(out) == (new if moment else before)
+        assert verify(out).notes() == []
 
 
 HOLD = """
