@@ -1,19 +1,25 @@
-"""Cases of `scripts/studies/fuzz_study.py`: spoiled inputs of every command, and mistakes that must be told."""
+"""Cases of `scripts/studies/fuzz_study.py`: spoiled inputs of every command, and mistakes that must be told; calls of
+every command on good data, with their pages; and ``--camera-name`` of those that read cameras."""
 
+import inspect
 import os
+import sys
 
 import numpy as np
 import pytest
 
-from stcal.cli.main import MESSAGE_CHARACTERS
+from stcal.cli.main import MESSAGE_CHARACTERS, main
+from stcal.errors import InputError
+from stcal.io.cameras import foreign_lenses
 from stcal.io.files import require_written
-from tests.commands import CALLS, COMMANDS
+from tests.commands import CALLS, COMMANDS, Call
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import OUT, Outcome, failures, hashes, lay_out
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, perform, went_through
 from tests.levels import FULL, sampled
+from tests.outcome import assert_error, ended
 from tests.report.browser import faults, opened, show, sideways_px
 
 pytestmark = pytest.mark.slow
@@ -177,3 +183,66 @@ def test_what_must_not_be_is_seen_and_files_are_watched(schedule):
     (written / "page.html").unlink()
     assert (folder / OUT).is_dir()
     assert kinds(schedule, 2, "", ERROR, 1.0) == {"input changed", "broken result", "earlier result lost"}
+
+
+MORE = (
+    Call("sfm design", "+own --size 130,120,110 --circles 9 --images 2 --camera @data/cameras.txt"),
+    Call(
+        "handeye plan",
+        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/board.toml "
+        "--count 2 --out >next.csv --workers 1",
+    ),
+)
+"""Commands whose call elsewhere has no camera file."""
+OF_CAMERAS = {each.command: each for each in (*CALLS, *MORE) if "--camera @" in each.words}
+
+
+@pytest.fixture
+def call(stock, tmp_path, monkeypatch, capsys):
+    """Runs a call with further words, after a change of its inputs, which are below ``folder``."""
+
+    def run(each, *more, change=lambda folder: None):
+        below, written = lay_out(stock, tmp_path / "call", each, earlier=False)
+        change(below)
+        monkeypatch.setattr(sys, "argv", ["stcal", *each.arguments(below, written), *more])
+        return ended(main, capsys)
+
+    return run
+
+
+def test_every_command_with_a_camera_chooses_one_of_several():
+    for name, command in COMMANDS.items():
+        options = inspect.signature(command).parameters
+        assert ("camera" in options) == ("camera_name" in options), name
+    assert OF_CAMERAS.keys() == {
+        name for name, command in COMMANDS.items() if "camera" in inspect.signature(command).parameters
+    }
+
+
+def two_cameras(each):
+    """Puts a second camera into the file of a call."""
+    words = each.split()
+    place = words[words.index("--camera") + 1].removeprefix("@")
+
+    def change(folder):
+        path = folder / place
+        (line,) = [line for line in path.read_text().splitlines() if line and line[0] != "#"]
+        path.write_text(f"{line}\n2 {line.split(maxsplit=1)[1]}\n")
+
+    return change
+
+
+@pytest.mark.parametrize("name", OF_CAMERAS)
+def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
+    each = OF_CAMERAS[name]
+    error = assert_error(call(each, change=two_cameras(each)), 2, "2 cameras", "choose of 1, 2", "--camera-name")
+    assert "\n" not in error
+    taken = []
+
+    def chosen(names, choice):
+        taken.append(choice)
+        raise InputError("E-CAMERA-SEVERAL", f"chosen: {choice}")
+
+    monkeypatch.setattr(foreign_lenses, "one_of", chosen)
+    assert_error(call(each, "--camera-name", "2", change=two_cameras(each)), 2, "chosen: 2")
+    assert taken == ["2"]

@@ -32,8 +32,7 @@ from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, secon
 from tests.levels import FULL, SLOW
 from tests.outcome import refuses
 from tests.sfm.report.test_report import Page
-from tests.sfm.truth import true_poses
-from tests.support.image_poses import pose_error
+from tests.support.image_poses import pose_error, true_poses
 
 CIRCLES = AsymmetricCirclesDesign(11, 5, 20.0, 6.0, "dark")
 OPTIONS = SceneOptions(seed=5, width=1728, height=1152, images_per_group=4)

@@ -272,7 +272,7 @@ def test_of_faces_compared_across_groups_only_the_moved_one_is_left_out():
 
 
 class Images:
-    """Images of seen_group 12 as they are labelled, to be spoilt."""
+    """Images of group 12 as they are labelled, to be spoilt."""
 
     def __init__(self, scene, observations):
         self.images = list(observations)

@@ -23,7 +23,7 @@ from stcal.sfm import MeasureOptions, Tracker, measure, read_target
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of, served
 from stcal.sfm.measurement.pose_report import poses_file
 from tests.outcome import fails_with
-from tests.sfm.truth import true_poses
+from tests.support.image_poses import true_poses
 
 
 @pytest.fixture
