@@ -107,7 +107,7 @@ def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
 
 
 def true_poses(truth: dict) -> dict[str, Rigid]:
-    """camera_from_target by image of a truth file, its frame by the plane of the reference face's circles as in a run."""
+    """camera_from_target by image of a truth file; its frame is laid by the reference face's circles as a run does."""
     face = reference_target().face(truth["reference_face"])
     circles = {c: np.array(truth["circles"][f"{face.id}:{c}"]) for c in face.ids}
     frame = face_frame(face, circles, "plane", np.array([0, 0, 1.0]))
