@@ -373,7 +373,7 @@ def test_a_face_that_one_image_alone_shows_goes_out_where_its_circles_contradict
     spoilt.assert_out(set())
     spoilt.move_px(3, "2:6", [1.5, -1.0])
     reasons = spoilt.assert_out({(3, f"2:{k}") for k in TARGET.face("2").ids})
-    assert all("no other image of the seen_group tells which circles are right" in reason for reason in reasons)
+    assert all("no other image of the group tells which circles are right" in reason for reason in reasons)
 
 
 def test_few_circles_of_a_face_are_held_to_where_others_have_it(spoilt):
