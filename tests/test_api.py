@@ -357,7 +357,8 @@ def test_a_table_and_arrays_make_the_robot_and_its_data():
     assert np.abs(robot.forward(arm, by_poses.found.q).translation - reached.translation).max() < 1e-3  # µm
 
 
-def test_images_in_memory_are_read_to_the_last_bit():
+def test_images_in_memory_are_read_to_the_last_bit_and_colours_in_the_channel_that_tells_them():
+    """Red 200 and green 102 have the same grey value."""
     rng = np.random.default_rng(3)
     grey, deep = rng.integers(0, 256, (40, 60), np.uint8), rng.integers(0, 65536, (40, 60), np.uint16)
     files, skipped = files_of_arrays({"12": [grey, deep], "13": [np.dstack([grey] * 3)]}, exclude=["12/1.png"])
@@ -367,6 +368,16 @@ def test_images_in_memory_are_read_to_the_last_bit():
         assert np.array_equal(decode(file.read(), file.name), grey)
     (both, _) = files_of_arrays({"12": [grey, deep]})
     assert np.array_equal(decode(both[1].read(), "12/1.png"), deep)
+    for scale in (1, 257):
+        image = np.zeros((40, 60, 3), np.uint8 if scale == 1 else np.uint16)
+        image[..., 1] = 102 * scale
+        image[10:30, 20:40] = (200 * scale, 0, 0)
+        png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+        for grey in (grey_of(image, "a"), decode(png, "a.png")):
+            assert grey[0, 0] == 0
+            assert grey[20, 30] == 200 * scale
+        image[:5] = 255 * scale  # something else is seen in grey: it stays
+        assert grey_of(image, "a")[20, 30] == pytest.approx(60 * scale, rel=0.02)
 
 
 def check(key: str) -> sfm.Check:
@@ -392,7 +403,7 @@ def test_checks_of_ones_own_have_their_own_names_and_lose_no_result():
         assert first.key != second.key
 
 
-def test_the_repr_of_a_large_result_is_a_line_that_tells_the_notes():
+def test_a_result_shows_itself_in_a_line_and_masked_values_are_refused():
     """A notebook prints it."""
     pair = np.random.default_rng(0).uniform(-100, 100, (60, 3))
     result = stcal.register.register(pair, pair + np.array([1.0, 2.0, 3.0]))
@@ -404,26 +415,9 @@ def test_the_repr_of_a_large_result_is_a_line_that_tells_the_notes():
     result = stcal.register.register(pair, off, method="least-squares")
     assert result.notes
     assert result.notes[0] in repr(result)
-
-
-def test_masked_values_are_refused_where_arrays_are_taken():
     pair = np.random.default_rng(0).uniform(-100, 100, (20, 3))
     other = np.ma.array(pair + 1.0, mask=np.zeros_like(pair, bool))
     stcal.register.register(pair, other)  # nothing is masked
     other.mask[4] = True
     for call in (lambda: stcal.register.register(pair, other), lambda: frozen(other)):
         refuses("E-ARRAY-NOT-FINITE … 3 values are masked; leave out their rows", call)
-
-
-@pytest.mark.parametrize("scale", [1, 257])
-def test_colours_of_equal_brightness_are_seen_in_the_channel_that_tells_them(scale):
-    """Red 200 and green 102 have the same grey value."""
-    image = np.zeros((40, 60, 3), np.uint8 if scale == 1 else np.uint16)
-    image[..., 1] = 102 * scale
-    image[10:30, 20:40] = (200 * scale, 0, 0)
-    png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
-    for grey in (grey_of(image, "a"), decode(png, "a.png")):
-        assert grey[0, 0] == 0
-        assert grey[20, 30] == 200 * scale
-    image[:5] = 255 * scale  # something else is seen in grey: it stays
-    assert grey_of(image, "a")[20, 30] == pytest.approx(60 * scale, rel=0.02)

@@ -434,12 +434,9 @@ def found(size: float = 1.0, seed: int = 1) -> dict[str, Rigid]:
     }
 
 
-def test_a_body_as_drawn_says_nothing():
+def test_a_body_as_drawn_says_nothing_and_sizes_and_faces_that_are_not_are_named():
     assert [not_as_drawn(found(seed=seed), CUBE) for seed in range(5)] == [[]] * 5
     assert not_as_drawn({"1": Rigid()}, CUBE) == []
-
-
-def test_sizes_and_faces_that_are_not_as_drawn_are_named():
     [size] = not_as_drawn(found(0.1), CUBE)
     assert re.match(r"not as drawn: faces are 0\.(1|09\d|10) times as far from one another as their rough_pose", size)
     poses = found()

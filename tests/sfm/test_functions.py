@@ -27,7 +27,7 @@ def written_json(stcal_sfm, out, *words) -> dict:
 
 
 @pytest.mark.slow
-def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
+def test_uncertainty_budget_and_exports(stcal_sfm, small_result, small_run, tmp_path):
     """Of a run just made, and of its folder."""
     words = "budget", small_run, "--field", "operator=A", "--no-strict"
     answer = written_json(stcal_sfm, tmp_path / "a.json", *words)
@@ -38,10 +38,6 @@ def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
     assert "A" in found.document().text()
     with fails_with("E-OPTION-VALUE … 62"):
         sfm.uncertainty_budget(small_run, fields={61 * "n": ""})
-
-
-@pytest.mark.slow
-def test_exports(stcal_sfm, small_result, small_run, tmp_path):
     for words, call in (
         (("export", "urdf"), lambda out: sfm.export_run(small_result, out)),
         (("export-database", "db", "--schema", "3.8"), lambda out: sfm.export_database(small_result, out, "3.8")),
@@ -155,7 +151,7 @@ def designs(tmp_path):
     return "--target", tmp_path / "target.toml", "--board", tmp_path / "board.toml"
 
 
-def test_simulate_with_the_camera_of_a_file(stcal_sfm, designs, tmp_path):
+def test_simulate_with_the_camera_of_a_file_and_faces_that_have_no_place(stcal_sfm, designs, tmp_path):
     camera = tmp_path / "cameras.txt"
     camera.write_text("1 SIMPLE_RADIAL 400 300 430 203 148 -0.05\n")
     call = "simulate", tmp_path / "data", *designs, "--camera", camera, "--images", 2, "--workers", 1
@@ -167,6 +163,12 @@ def test_simulate_with_the_camera_of_a_file(stcal_sfm, designs, tmp_path):
     code, _, err = stcal_sfm(*call, "--fisheye", 100)
     assert code == 2
     assert "two cameras" in err
+    target = load_target(designs[1])
+    first, second = target.faces
+    save_target(designs[1], replace(target, faces=(first, replace(second, rough_target_from_face=None))))
+    code, _, err = stcal_sfm("simulate", tmp_path / "none", *designs)
+    assert code == 2
+    assert f"does not say where face {second.id} is; add approximate rough_pose = {{ origin_mm, x, normal }}" in err
 
 
 @pytest.mark.slow
@@ -189,15 +191,6 @@ def test_simulate_with_lens_and_rim(stcal_sfm, tmp_path):
         assert (code, err.count("error:")) == (2, 1)
         assert names in err
     assert not (tmp_path / "none").exists()
-
-
-def test_simulate_says_which_faces_have_no_place(stcal_sfm, designs, tmp_path):
-    target = load_target(designs[1])
-    first, second = target.faces
-    save_target(designs[1], replace(target, faces=(first, replace(second, rough_target_from_face=None))))
-    code, _, err = stcal_sfm("simulate", tmp_path / "data", *designs)
-    assert code == 2
-    assert f"does not say where face {second.id} is; add approximate rough_pose = {{ origin_mm, x, normal }}" in err
 
 
 def test_versions_for_reports_of_faults(monkeypatch, capsys):

@@ -77,8 +77,9 @@ def full(group):
     return jacobian, np.linalg.inv(bordered)[:size, :size]
 
 
-def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations(network, full, group):
-    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown."""
+def test_covariance_and_redundancy_are_those_of_the_full_equations_and_squares_are_chi_square(network, full, group):
+    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown. Of 1000 draws of noise
+    as many are beyond the quantile of one in a thousand as there should be."""
     p = 3 * len(group[0].labels)
     scale = np.sqrt(np.diag(network.covariance_mm2))
     np.testing.assert_allclose(
@@ -95,10 +96,22 @@ def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations
     assert len(square) == len(group[0].images)
     assert network.noise() == 1.0  # σ that are as stated are never made smaller
     assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0
+    jacobian, cofactor = full
+    projector = np.eye(len(jacobian)) - jacobian @ cofactor @ jacobian.T
+    rng, beyond, count = np.random.default_rng(4), 0, 0
+    for _ in range(DRAWS):
+        residual = (projector @ rng.standard_normal(len(jacobian))).reshape(-1, 2)
+        drawn = replace(network, residual=residual)
+        square, freedom = drawn.squares_of_observations()
+        held = freedom > 0
+        beyond += int((chdtrc(freedom[held], square[held]) < 1e-3).sum())
+        count += int(held.sum())
+    assert 0.8 < beyond / (1e-3 * count) < 1.25
 
 
-def test_scores_are_estimates_beside_all_others(network, full, group):
-    """By the general equations, and by those of one image of one parameter for each of its coordinates."""
+def test_scores_are_estimates_beside_all_others_and_find_a_fault_where_it_is(network, full, group):
+    """By the general equations, and by those of one image of one parameter for each of its coordinates. One image's
+    focal length 1e-3 longer is eleven times its σ there."""
     model, rng = group[0], np.random.default_rng(0)
     column = rng.normal(size=(len(model.image_index), 2, 1))
     test = solve_score(*network.score(column))
@@ -123,10 +136,6 @@ def test_scores_are_estimates_beside_all_others(network, full, group):
     assert test.freedom == 1
     assert test.statistic == pytest.approx(0.5)
     assert normal @ test.estimate == pytest.approx([1.0, 1.0])
-
-
-def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
-    """One image's focal length 1e-3 longer: eleven times its σ there."""
     model, camera = group
     image = 1
     own = model.image_index == image
@@ -138,21 +147,6 @@ def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
     statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]
     assert np.argmax(statistics) == image
     assert solve_score(normal[image], right[image]).estimate[0] == pytest.approx(1e-3, rel=0.05)
-
-
-def test_squares_of_observations_are_chi_square(network, full):
-    """Of 1000 draws of noise: as many beyond the quantile of one in a thousand as there should be."""
-    jacobian, cofactor = full
-    projector = np.eye(len(jacobian)) - jacobian @ cofactor @ jacobian.T
-    rng, beyond, count = np.random.default_rng(4), 0, 0
-    for _ in range(DRAWS):
-        residual = (projector @ rng.standard_normal(len(jacobian))).reshape(-1, 2)
-        drawn = replace(network, residual=residual)
-        square, freedom = drawn.squares_of_observations()
-        held = freedom > 0
-        beyond += int((chdtrc(freedom[held], square[held]) < 1e-3).sum())
-        count += int(held.sum())
-    assert 0.8 < beyond / (1e-3 * count) < 1.25
 
 
 def test_weights_are_hubers_and_costs_are_theirs_and_those_of_dots_off_their_design(group):

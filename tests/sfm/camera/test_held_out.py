@@ -59,7 +59,9 @@ def test_gross_errors_are_left_out_and_other_points_stay():
 
 
 @pytest.mark.slow
-def test_a_view_of_gross_errors_is_skipped_and_views_without_stay_as_they_are():
+def test_a_view_of_gross_errors_is_skipped_and_residuals_held_out_are_those_of_noise():
+    """Views without gross errors stay as they are. Held out: σ of the centres times √(1 − 6/2n) for the pose of n dots,
+    wider by what 24 views leave of intrinsics and dots: below 3 %; 2900 coordinates scatter by 1.3 %."""
     board, rng = replace(BOARD, rows=5, columns=6), np.random.default_rng(6)
     views = views_of(np.random.default_rng(5), count=6, board=board)
     wrong = np.arange(len(views[3]))[: int(0.6 * len(views[3]))]
@@ -67,17 +69,6 @@ def test_a_view_of_gross_errors_is_skipped_and_views_without_stay_as_they_are():
     kept, skipped, _ = calibration.without_gross_errors(spoiled, board, calibrated(spoiled, board=board))
     assert [each.name for each in skipped] == [views[3].name]
     assert all(a is b for a, b in zip(kept, [*views[:3], *views[4:]], strict=True))
-
-
-FISHEYE = Camera(2592, 1728, [1100.0, 1098.0], [1301.0, 859.0], [0.02, -0.01, 0, 0, 0.003, 0, 0, 0], True)
-RADIAL = Camera(2592, 1728, [2790.0, 2790.0], [1301.0, 859.0], [-0.06, 0, 0, 0, 0, 0, 0, 0])
-PINHOLE = Camera(2592, 1728, [2790.0, 2770.0], [1301.0, 859.0], np.zeros(8))
-
-
-@pytest.mark.slow
-def test_held_out_residuals_are_those_of_noise():
-    """σ of the centres times √(1 − 6/2n) for the pose of n dots, wider by what 24 views leave of intrinsics and dots:
-    below 3 %; 2900 coordinates scatter by 1.3 %."""
     views = views_of(np.random.default_rng(0), count=24)
     dots = np.mean([len(view) for view in views])
     found = calibration.held_out(calibrated(views), views, BOARD)
@@ -86,6 +77,11 @@ def test_held_out_residuals_are_those_of_noise():
     assert len(found.in_sigma) == 24
     spoiled = [*views[:3], moved(views[3], [5], 4.0), *views[4:]]  # a dot that is wrong does not count
     assert calibration.held_out(calibrated(spoiled), spoiled, BOARD).rms_px() < 1.05 * found.rms_px()
+
+
+FISHEYE = Camera(2592, 1728, [1100.0, 1098.0], [1301.0, 859.0], [0.02, -0.01, 0, 0, 0.003, 0, 0, 0], True)
+RADIAL = Camera(2592, 1728, [2790.0, 2790.0], [1301.0, 859.0], [-0.06, 0, 0, 0, 0, 0, 0, 0])
+PINHOLE = Camera(2592, 1728, [2790.0, 2770.0], [1301.0, 859.0], np.zeros(8))
 
 
 @pytest.mark.full

@@ -172,7 +172,7 @@ def numberings_of(reading, keep) -> list[dict]:
     return [{keep[c]: tuple(rc) for c, rc in zip(reading.rows, own, strict=True)} for own in reading.numberings]
 
 
-def test_a_board_has_all_numberings_that_fit():
+def test_a_board_has_all_numberings_that_fit_and_takes_no_discs_around_it():
     """Two or four up to half a turn, one with a larger corner dot. Hidden dots leave those open that fit; of a strip
     cut off by the image, the column beyond the border is the missing one: the other side is in view and empty."""
     for tilt, azimuth, roll in ((0, 0, 0), (65, 200, 30)):
@@ -208,9 +208,6 @@ def test_a_board_has_all_numberings_that_fit():
     assert {i: divmod(i, 9) for i in keep} in numberings
     # The other one is the same place after half a turn of the board; no numbering is shifted by a column.
     assert len(numberings) == 2
-
-
-def test_discs_around_the_board_are_not_taken_into_it():
     keep, ellipses = board_ellipses(BOARD, pose(45, 80, 20, facing=False))
     assert find(junk(300), BOARD) == []
     readings = find(Ellipses.concatenate([ellipses, junk(120)]), BOARD)
@@ -374,18 +371,20 @@ def of_a_square_and_a_bar():
     return cv2.rectangle(image, (500, 200), (700, 215), 200, -1)
 
 
-@pytest.mark.parametrize(
-    ("image", "polarity"),
-    [
+def test_what_is_no_circle_is_not_found_and_no_grey_image_of_the_camera_refused():
+    for image, polarity in (
         (picture(), "bright"),
         (add_ellipse(picture(), (600, 450), (20, 20)), "dark"),
         (of_a_square_and_a_bar(), "bright"),
         (cv2.circle(picture(), (5, 400), 25, 200, -1), "bright"),
-    ],
-    ids=["plain", "the other polarity", "no ellipses", "cut by the border"],
-)
-def test_what_is_no_circle_is_not_found(image, polarity):
-    assert len(find_ellipses(image, polarity, EllipseOptions())) == 0
+    ):
+        assert len(find_ellipses(image, polarity, EllipseOptions())) == 0
+    for image, error in (
+        (checkerboard()[::2, ::2], "E-IMAGE-SIZE … 200×150 px, camera 400×300"),
+        (np.dstack([checkerboard()] * 3), "E-IMAGE-TYPE … (300, 400, 3) … green"),
+        (checkerboard() / 255, "E-IMAGE-TYPE … float64"),
+    ):
+        refuses(error, stage.detect_image, image, SMALL_CAMERA, reference_target(), None, EllipseOptions())
 
 
 SMALL_CAMERA = Camera(400, 300, np.array([500.0, 500.0]), np.array([200.0, 150.0]), np.zeros(8))
@@ -394,18 +393,6 @@ SMALL_CAMERA = Camera(400, 300, np.array([500.0, 500.0]), np.array([200.0, 150.0
 def checkerboard(side: int = 6) -> np.ndarray:
     y, x = np.mgrid[: SMALL_CAMERA.height, : SMALL_CAMERA.width]
     return cv2.GaussianBlur((((x // side) + (y // side)) % 2 * 160 + 40).astype(np.uint8), (0, 0), 0.7)
-
-
-@pytest.mark.parametrize(
-    ("image", "error"),
-    [
-        (checkerboard()[::2, ::2], "E-IMAGE-SIZE … 200×150 px, camera 400×300"),
-        (np.dstack([checkerboard()] * 3), "E-IMAGE-TYPE … (300, 400, 3) … green"),
-        (checkerboard() / 255, "E-IMAGE-TYPE … float64"),
-    ],
-)
-def test_an_array_that_is_no_grey_image_of_the_camera_is_refused(image, error):
-    refuses(error, stage.detect_image, image, SMALL_CAMERA, reference_target(), None, EllipseOptions())
 
 
 @pytest.mark.slow

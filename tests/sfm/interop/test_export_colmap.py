@@ -121,9 +121,10 @@ def test_the_schema_is_what_the_program_itself_makes(schema, databases, tmp_path
     assert described(databases[schema]) == described(tmp_path / "empty.db")
 
 
-def test_schemas_are_the_published_ones_and_everything_is_kept(databases, small_run):
+def test_schemas_are_the_published_ones_all_is_kept_and_pycolmap_makes_the_same_model(databases, small_run, tmp_path):
     """Against what was recorded when each version was run; the versions themselves are not here. Every row and value of
-    the run's own database, its type and its place."""
+    the run's own database, its type and its place. pycolmap brings the older schema back to its own, and finds exactly
+    the same numbers in it."""
     lines = {schema: described(databases[schema]) for schema in PUBLISHED}
     assert {name: hashlib.sha256("\n".join(own).encode()).hexdigest()[:16] for name, own in lines.items()} == PUBLISHED
     own = small_run / "colmap/database.db"
@@ -139,6 +140,16 @@ def test_schemas_are_the_published_ones_and_everything_is_kept(databases, small_
         with read_only(path) as opened:
             assert opened.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
             assert opened.execute("PRAGMA foreign_key_check").fetchall() == []
+    names, pair = first_group(small_run)
+    own = small_run / "colmap/database.db"
+    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
+    assert len(ours) >= 80
+    for schema in ("3.8", "3.13"):
+        model = mapped(databases[schema], tmp_path / schema, names, pair)
+        assert model.num_reg_images() == len(names)
+        theirs = points_by_track(model)
+        assert theirs.keys() == ours.keys()
+        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
 def first_group(run) -> tuple[list[str], tuple[int, int]]:
@@ -163,20 +174,6 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
         tuple(sorted((element.image_id, element.point2D_idx) for element in point.track.elements)): point.xyz
         for point in model.points3D.values()
     }
-
-
-def test_pycolmap_makes_the_same_model_of_the_export(small_run, databases, tmp_path):
-    """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
-    names, pair = first_group(small_run)
-    own = small_run / "colmap/database.db"
-    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
-    assert len(ours) >= 80
-    for schema in ("3.8", "3.13"):
-        model = mapped(databases[schema], tmp_path / schema, names, pair)
-        assert model.num_reg_images() == len(names)
-        theirs = points_by_track(model)
-        assert theirs.keys() == ours.keys()
-        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
 def test_a_refused_export_writes_and_overwrites_nothing_nor_a_file_that_appears_meanwhile(saved, tmp_path, monkeypatch):

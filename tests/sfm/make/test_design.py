@@ -61,7 +61,7 @@ class Alike(TargetDesign):
 
 
 @pytest.mark.slow
-def test_likeness_is_found_where_there_is_some(made):
+def test_circles_are_seen_well_keep_apart_and_likeness_is_found_where_there_is_some(made):
     """A face beside itself, turned and mirrored; and the cases of hidden circles fail."""
     face = made.target.faces[0]
     turned = type(face)("turned", face.ids, face.xy_mm @ [[0, 1], [-1, 0]], face.radius_mm, face.origin, face.x, face.y)
@@ -74,6 +74,13 @@ def test_likeness_is_found_where_there_is_some(made):
     camera = DesignOptions(SIZE, width=2592).ideal_camera()
     failed, cases = unnamed_cases(two, camera, 800.0, HIDDEN, None)
     assert len(failed) == cases == 168
+    target, options = made.target, made.options
+    px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)
+    assert 2 * made.radius_mm * px_per_mm * np.sqrt(np.cos(np.radians(70))) > 1.4 * 4.5
+    for face in target.faces:
+        assert set(face.radius_mm) == {made.radius_mm, LARGE * made.radius_mm}
+        gap = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) - face.radius_mm[:, None] - face.radius_mm
+        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
 
 
 @pytest.mark.full
@@ -84,17 +91,6 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
         once.setattr(make, "ATTEMPTS", 1)
         refuses("E-MAKE-UNNAMED … 1 … 420 … 1", make_target, options)
     assert make_target(options).cases == 5 * 84
-
-
-@pytest.mark.slow
-def test_circles_are_seen_well_and_keep_apart(made):
-    target, options = made.target, made.options
-    px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)
-    assert 2 * made.radius_mm * px_per_mm * np.sqrt(np.cos(np.radians(70))) > 1.4 * 4.5
-    for face in target.faces:
-        assert set(face.radius_mm) == {made.radius_mm, LARGE * made.radius_mm}
-        gap = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) - face.radius_mm[:, None] - face.radius_mm
-        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
 
 
 def test_faces_lie_on_the_box_some_sides_alone_have_circles_and_sizes_are_three_lengths():

@@ -59,7 +59,7 @@ def off_sigmas(pose, other):
     return np.abs(pose_error(other.camera_from_target, pose.camera_from_target)) / np.sqrt(np.diag(pose.covariance))
 
 
-def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
+def test_a_followed_pose_is_that_of_a_search_and_what_jumps_is_searched_and_found(film, frames, target, model):
     follower, searcher = (Tracker(target, model[1], film.board) for _ in range(2))
     for i in range(IMAGES):
         searcher.forget()
@@ -69,9 +69,6 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         assert off_sigmas(own, other).max() < OTHER_BAND
         error = pose_error(own.camera_from_target, film.groups["12"].camera_from_target[i])
         assert error @ np.linalg.solve(own.covariance, error) < 28  # χ² of 6, one in 10 000
-
-
-def test_what_jumps_and_what_comes_after_an_image_without_the_target_is_searched_and_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     truth = film.groups["12"].camera_from_target
     for i, searched in ((0, True), (1, False), (None, True), (2, True), (25, True), (3, True)):

@@ -204,7 +204,7 @@ def test_a_face_that_was_expected_or_read_and_left_out_is_missing():
     assert (told.verdict, told.missing, "face 5 was read in 3 images" in told.use) == ("part", [], True)
 
 
-def test_a_group_that_was_left_out_calls_for_care_and_says_why():
+def test_a_group_that_was_left_out_calls_for_care_and_after_no_there_are_no_micrometres():
     """In place of what limits the rest, which is not what the user should look at first."""
     own = report()
     note = Note.of_group("25", MappingError("E-GROUP-NO-BOARD", "group 25: no board in 4 images; keep it in view"))
@@ -215,9 +215,6 @@ def test_a_group_that_was_left_out_calls_for_care_and_says_why():
     assert (told.limit, told.next) == ("Left out: group 25: no board in 4 images.", "Keep it in view.")
     own["checks"][0] = check("a", "suspicious")
     assert judgement_of(own).use.count("With care: ") == 1
-
-
-def test_after_no_there_are_no_micrometres_but_what_does_not_hold():
     for key in (key for key, (_, invalid) in CHECKS.items() if invalid):
         failed = report(check(key, "failed", remedy="x"), check("b", "passed"), f3=[3.04, 1.0, 1.0])
         told = judgement_of(failed).model_dump()

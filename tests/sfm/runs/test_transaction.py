@@ -62,19 +62,17 @@ def test_new_results_take_the_earlier_ones_place_and_a_run_that_fails_leaves_the
     assert json.loads((out / RUN_MARKER).read_text())["program"] == "stcal-sfm"
 
 
-@pytest.mark.parametrize("names", [("detections.csv",), ("detections.csv", "faces.json", "colmap")])
-def test_a_first_run_that_fails_leaves_what_helps_to_see_why(tmp_path, names):
+def test_a_first_run_that_fails_leaves_what_helps_to_see_why_and_one_of_too_long_a_path_nothing(tmp_path):
     """And no half results, as on a disk that fills: a ``faces.json`` without its report would pass for a result."""
-    with pytest.raises(DetectionError, match=r"^nothing found$"):
-        fail(tmp_path / "run", names)
-    assert content(tmp_path / "run") == {"detections.csv": "new", "overlays/12/a.jpg": "new"}
-    assert not (tmp_path / "run" / STAGE).exists()
-
-
-def test_a_path_that_is_too_long_for_a_database_is_refused_at_once(tmp_path):
     with fails_with("E-OUTPUT-LENGTH … 500"):
         make(tmp_path / ("x" * 200) / ("y" * 200) / ("z" * 200), "new")
     assert not any(tmp_path.iterdir())
+    for names in (("detections.csv",), ("detections.csv", "faces.json", "colmap")):
+        out = tmp_path / f"run {len(names)}"
+        with pytest.raises(DetectionError, match=r"^nothing found$"):
+            fail(out, names)
+        assert content(out) == {"detections.csv": "new", "overlays/12/a.jpg": "new"}
+        assert not (out / STAGE).exists()
 
 
 def ended_at(moment, monkeypatch, write_results):
