@@ -19,7 +19,7 @@ from stcal.sfm.detect.detect_files import DetectedImage, require_upright
 from stcal.sfm.detect.image import read_image
 from stcal.sfm.detect.labelling import label_groups
 from tests.levels import sampled
-from tests.sfm.detect.degraded import KINDS, study
+from tests.sfm.detect.conftest import KINDS, study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
 
