@@ -5,7 +5,7 @@
 A table of figures in README.md or docs/ has a comment directly above it, ``<!-- printed by: COMMAND -->``; COMMAND is a
 script with its arguments. ``docs/printed/NAME.txt`` holds what it printed, after a line with the command and the commit
 that it ran at; a document may show some of the rows. With names the commands of these are run and stored anew; without,
-the documents are compared with what is stored, and what differs is printed. ``tests/test_printed.py`` does the same,
+the documents are compared with what is stored, and what differs is printed. ``tests/test_documents.py`` does the same,
 and runs the quick ones.
 """
 

@@ -24,17 +24,14 @@ import typer.main
 from hypothesis import HealthCheck, settings
 
 from stcal.geometry.rigid import Rigid, Similarity
+from stcal.sfm import RunOptions, RunResult, run
 from stcal.sfm.adjust.chain import chain_faces, faces_of_group
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.group_model import ImageObservations, WorldModel
-from stcal.sfm.pipeline import run
 from stcal.sfm.planning.forecast import observe, true_models
-from stcal.sfm.runs.run_options import RunOptions
-from stcal.sfm.runs.saved import RunResult
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.synthetic import Scene, SceneOptions, make_scene, write_dataset
 from tests.shared import Once, without_rights
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from stcal import Camera, compare_cameras
 from stcal.cli.instruments import camera_app as app
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.read import read_camera, save_camera
 from stcal.report.camera_figures import shown
 from tests.outcome import lines_of, refuses
@@ -92,12 +91,14 @@ def test_the_sigma_of_a_lens_that_is_fitted_is_missed(tmp_path):
     assert said == [f"warning: not in {tmp_path / 'b.txt'}: {lost}"]
 
 
-def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
+def test_a_size_that_the_file_does_not_state_is_asked_for_and_two_sizes_are_refused(folder):
     (folder / "i.yaml").write_text("K: [900, 0, 640, 0, 905, 475, 0, 0, 1]\nD: [0, 0, 0, 0]\n")
     refuses("E-CAMERA-SIZE … --size", call, "show", folder / "i.yaml")
     assert "1280×960" in call("show", folder / "i.yaml", "--size", "1280x960")
     refuses("E-OPTION-SIZE … --size … 12", call, "show", folder / "i.yaml", "--size", "12")
     refuses("E-OPTION-FORM … .json … --form", call, "convert", folder / "a.txt", folder / "b.json")
+    save_camera(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
+    refuses("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480", call, "compare", folder / "a.txt", folder / "b.txt")
 
 
 @pytest.mark.slow
@@ -122,11 +123,6 @@ def test_a_principal_point_is_mostly_a_turn_and_a_focal_length_is_not():
     moved = compare_cameras(CAMERA, shifted)
     assert np.nanmax(moved.lengths()) < 2.5  # mostly a turn
     assert moved.second_from_first.angle_rad() == pytest.approx(5 / 900, rel=0.2)
-
-
-def test_cameras_of_two_sizes_are_refused(folder):
-    save_camera(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
-    refuses("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480", call, "compare", folder / "a.txt", folder / "b.txt")
 
 
 @pytest.mark.slow

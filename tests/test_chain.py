@@ -12,18 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from stcal import Camera, Rigid, save_camera
 from stcal.cli.main import main, main_sfm
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.read import save_camera
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml
-from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot import forward, load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import mh80
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.synthetic import RenderOptions, SceneOptions, make_scene, write_dataset
 from tests.locate.drawn_target import LAYOUT, photo, tilted
 
 pytestmark = pytest.mark.full

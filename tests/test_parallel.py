@@ -142,16 +142,13 @@ def test_threads_and_what_is_left_of_them(said, program, answer):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # what it is about
-def test_a_process_of_a_pool_works_alone():
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_process_of_a_pool_works_alone_and_a_forked_one_starts_its_own():
+    """The server of the process that forked it answers that one alone."""
     with multiprocessing.get_context("fork").Pool(1) as pool:
         found, notes = pool.apply(in_a_pool)
     assert found == [(0, 8), (1, 8)]
     assert notes == ["a process of multiprocessing.Pool may start no others: one process works, more slowly"]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_forked_process_starts_its_own():
-    """The server of the process that forked it answers that one alone."""
     dict(run_parallel(process, [(0,), (1,)], 2))
     with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
         assert pool.submit(in_a_pool).result(60) == ([(0, 8), (1, 8)], [])
@@ -189,13 +186,24 @@ def end_elsewhere(parent: int) -> int:
     return parent
 
 
-def test_work_goes_on_here_when_a_process_is_ended():
+def test_work_goes_on_here_when_a_process_is_ended_and_processes_end_when_it_is_broken_off():
     done = []
     with kept_processes(2):
         assert (
             run_in_order(end_elsewhere, [(os.getpid(),)] * 4, progress=lambda *at: done.append(at)) == [os.getpid()] * 4
         )
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+    def broken_off():
+        with kept_processes(2):
+            dict(run_parallel(process, [(0,), (1,)]))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        broken_off()
+    for child in multiprocessing.active_children():
+        child.join(10)
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow
@@ -213,19 +221,6 @@ def test_files_beside_the_user_are_no_modules(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("[(0, 8), (1, 8)]\n", "")
-
-
-def test_processes_end_when_the_work_is_broken_off():
-    def broken_off():
-        with kept_processes(2):
-            dict(run_parallel(process, [(0,), (1,)]))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        broken_off()
-    for child in multiprocessing.active_children():
-        child.join(10)
-    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""What commands print is text: a terminal obeys nothing of it."""
+"""What commands print is text, of which a terminal obeys nothing; and no command writes over what it was given to read:
+walked over all commands and all their options."""
 
 import inspect
 import io
@@ -12,15 +13,17 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from typer.models import OptionInfo
+from typer.models import OptionInfo, ParameterInfo
 from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import options, terminal
 from stcal.cli.help import FIRST_WEEK, PANELS
 from stcal.cli.main import app, main
+from stcal.cli.options import ALWAYS_NEW
 from stcal.errors import lacks_memory
-from tests.commands import COMMANDS
+from stcal.io.files import RUN_ENTRIES, RUN_MARKER, keep_apart
+from tests.commands import CALLS, COMMANDS, paths_of
 from tests.outcome import INPUT, assert_error, ended, fails_with, refuses
 
 CLI = Path(stcal.__file__).parent / "cli"
@@ -46,11 +49,13 @@ def test_what_a_terminal_would_obey_is_a_question_mark(capsys, name):
     assert "0.2 µm ± 3 mdeg – σ\n\u2009fine\n" in text
 
 
-def test_every_command_prints_through_it():
+def test_every_command_prints_through_it_and_can_be_quiet_or_say_more():
     for path in CLI.glob("*.py"):
         found = re.findall(r"(?<![\w.])print\((?!stcal|said|f\"error)", path.read_text(encoding="utf-8"))
         allowed = {"terminal.py": 3, "main.py": 3}.get(path.name, 0)
         assert len(found) <= allowed, path.name
+    for command in COMMANDS.values():
+        assert {"quiet", "verbose"} <= set(inspect.signature(command).parameters)
 
 
 @pytest.mark.parametrize(
@@ -89,15 +94,14 @@ def test_too_little_address_space_is_said_before_libraries_load(words, code):
     assert ended.stderr == (said if code else "")
 
 
-def test_the_version_loads_nothing():
+def test_the_package_is_the_program_and_version_and_help_load_little():
+    """Numerics take longer than all the rest; Typer itself loads pydantic."""
     code = "import sys; from stcal.cli.entry import main; main(); print('typer' in sys.modules)"
     assert printed(code, "--version") == f"{stcal.__version__}\nFalse\n"
-
-
-def test_help_loads_no_numerics():
-    """They take longer than all the rest; Typer itself loads pydantic."""
     code = "import sys, stcal.cli.main; print([m for m in ('numpy', 'yaml', 'rich.progress') if m in sys.modules])"
     assert printed(code) == "[]\n"
+    words = [sys.executable, "-P", "-m", "stcal", "--version"]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip() == stcal.__version__
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device there")
@@ -127,21 +131,13 @@ def test_a_file_for_standard_output_needs_one_that_is_open(monkeypatch):
             terminal.write(terminal.STANDARD_OUTPUT, {})
 
 
-def test_the_package_is_the_program():
-    words = [sys.executable, "-P", "-m", "stcal", "--version"]
-    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip() == stcal.__version__
-
-
-def test_h_is_help():
+def test_help_shows_a_dozen_options_all_on_demand_each_once_and_h_is_help():
     """Of the program, of each group and of each command; the same text as with the whole word."""
     for words in ("", *COMMANDS):
         short, long = (CliRunner().invoke(app, [*words.split(), option]) for option in ("-h", "--help"))
         assert (short.exit_code, short.output) == (0, long.output), words
         assert short.output.startswith("Usage: "), words
         assert re.search(r"-h, --help +Show this message and exit\.", short.output), words
-
-
-def test_help_shows_a_dozen_options_and_all_on_demand_each_once():
     used = set()
     for words, callback in COMMANDS.items():
         each = [CliRunner().invoke(app, [*words.split(), option]).output for option in ("--help", "--help-all")]
@@ -237,41 +233,30 @@ def test_a_command_that_works_in_silence_says_what_it_is_at(capsys, monkeypatch,
     assert len(said) in ((0,) if quiet or waits else (1, 2, 3))
 
 
-@pytest.mark.parametrize("word", ["--quiet", "-q"])
-def test_a_quiet_command_says_errors_alone(program, tmp_path, word):
-    assert program("robot", "init", tmp_path / "a.toml", word) == (0, "", "")
-    assert (tmp_path / "a.toml").exists()
-    assert_error(program("robot", "init", tmp_path / "a.toml", word), INPUT, "E-OUTPUT-EXISTS")
-
-
-def test_warnings_of_a_quiet_command(capsys):
+def test_a_quiet_command_says_errors_warnings_and_a_verdict_that_is_not_good_alone(program, tmp_path, capsys):
+    """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
+    for word in ("--quiet", "-q"):
+        assert program("robot", "init", tmp_path / "a.toml", word) == (0, "", "")
+        assert (tmp_path / "a.toml").exists()
+        assert_error(program("robot", "init", tmp_path / "a.toml", word), INPUT, "E-OUTPUT-EXISTS")
     with terminal.manner(True, False):
         terminal.print_each("note", ["a"])
         terminal.print_each("warning", ["b\x1b"])
     assert capsys.readouterr() == ("", "warning: b?\n")
+    for rule in RULES:
+        for failed, verdict in ((["a", "b"], "do not use: a"), ([], "with care: c")):
+            with terminal.manner(True, False):
+                rule(False, failed, None, verdict)
+                assert capsys.readouterr() == ("", f"warning: {verdict}\n")
+                rule(False, [], None)
+                if failed:
+                    refuses("E-CHECKS-FAILED … a", rule, True, failed, None, verdict)
+            with terminal.manner(False, False):
+                rule(False, failed, None, verdict)
+            assert capsys.readouterr() == ("", "")
 
 
 RULES = (options.require_passed, options.require_usable)
-
-
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize(("failed", "verdict"), [(["a", "b"], "do not use: a"), ([], "with care: c")])
-def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, verdict):
-    """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
-    with terminal.manner(True, False):
-        rule(False, failed, None, verdict)
-        assert capsys.readouterr() == ("", f"warning: {verdict}\n")
-        rule(False, [], None)
-        if failed:
-            refuses("E-CHECKS-FAILED … a", rule, True, failed, None, verdict)
-    with terminal.manner(False, False):
-        rule(False, failed, None, verdict)
-    assert capsys.readouterr() == ("", "")
-
-
-def test_every_command_can_be_quiet_or_say_more():
-    for command in COMMANDS.values():
-        assert {"quiet", "verbose"} <= set(inspect.signature(command).parameters)
 
 
 def test_files_are_written_before_a_reader_such_as_head_ends_the_command(tmp_path, monkeypatch):
@@ -288,3 +273,110 @@ def test_files_are_written_before_a_reader_such_as_head_ends_the_command(tmp_pat
     with pytest.raises(BrokenPipeError):
         command()
     assert (tmp_path / "page.html").read_text() == "the page"
+
+
+FOLDERS = {(name, "out") for name in ("run", "detect", "demo", "from_photos", "export_model", "capture")}
+FOLDERS |= {(name, "folder") for name in ("init", "design", "simulate")}
+"""New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
+WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
+EVERY = list(COMMANDS.values())
+PAIRS = [
+    (command, output, read)
+    for command in EVERY
+    for output in sorted(command.outputs)
+    for read in paths_of(command)
+    if read not in command.outputs and (command.__name__, read) not in FOLDERS
+]
+
+
+def test_every_command_has_a_call_that_goes_through_and_every_option_that_writes_is_known():
+    assert {call.command for call in CALLS} == set(COMMANDS)
+    for command in EVERY:
+        for name, says in paths_of(command).items():
+            writes = name in command.outputs or (command.__name__, name) in FOLDERS
+            assert writes == says.startswith(WRITES), (command.__name__, name, says)
+    assert len(PAIRS) > 60
+
+
+def test_no_output_replaces_an_input_or_a_file_in_silence(tmp_path):
+    """The file itself, by another way to it, and a file in a folder that is read. One rule for every file that any
+    command writes, before its work; links, to nothing too, are files."""
+    own = tmp_path / "given"
+    own.write_text("mine")
+    another_way = tmp_path / "." / "x" / ".." / "given"
+    for command, output, read in PAIRS:
+        given = dict.fromkeys(paths_of(command))
+        for paths in ({read: own, output: own}, {read: own, output: another_way}, {read: tmp_path, output: own}):
+            refuses("E-OUTPUT-IS-INPUT … given", command, **given | paths)
+    assert own.read_text() == "mine"
+    place, link = tmp_path / "earlier", tmp_path / "link"
+    place.write_text("a better one")
+    link.symlink_to(tmp_path / "nothing")
+    for command in EVERY:
+        for output in command.outputs if command.__name__ not in ALWAYS_NEW else ():
+            for path in (place, link):
+                with fails_with(f"E-OUTPUT-EXISTS … {path} … --overwrite"):
+                    command(**dict.fromkeys(paths_of(command)) | {output: path})
+            assert "overwrite" in inspect.signature(command).parameters
+    assert place.read_text() == "a better one"
+
+
+def test_overwrite_replaces_what_is_there_and_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch, capsys):
+    """The table of an earlier call, and only with the option. `measure --serve` beside an earlier poses.csv: the file
+    of the camera is what is refused."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "b.toml").write_text("mine")
+
+    def init(*more):
+        monkeypatch.setattr("sys.argv", ["stcal", "robot", "init", "b.toml", *more])
+        return ended(main, capsys)
+
+    assert_error(init(), 2, "E-OUTPUT-EXISTS", "error: b.toml: exists; give another name, or --overwrite to replace it")
+    assert (tmp_path / "b.toml").read_text() == "mine"
+    assert init("--overwrite")[::2] == (0, "")
+    assert "[[joint]]" in (tmp_path / "b.toml").read_text()
+    monkeypatch.chdir(tmp_path)
+    Path("poses.csv").write_text("an earlier table")
+    given = {"camera": tmp_path / "none.txt", "faces": tmp_path / "none.json", "out": Path("poses.csv")}
+    refuses("E-OUTPUT-EXISTS … --out poses.csv", COMMANDS["sfm measure"], **given, images=tmp_path / "images")
+    with fails_with("E-FILE-UNREADABLE … none.json"):
+        COMMANDS["sfm measure"](
+            **given, target=None, board=None, sigma_factor=None, json_file=None, report=None, joints=None,
+            previous=False, sequence=False, scheduler=None, send_images=False, strict=False, serve=True,
+            min_diameter=None, max_diameter=450.0, host="127.0.0.1", port=0, max_megabytes=1.0, workers=None,
+        )  # fmt: skip
+
+
+def test_outputs_are_kept_apart_from_one_another_and_from_what_is_read(tmp_path, monkeypatch):
+    """A file beside a run's own is written again, and one in a folder of images, from where no command reads it."""
+    for name in (RUN_MARKER, "advice.json", "faces.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    keep_apart([("--json", tmp_path / "advice.json")], [("run", tmp_path)])
+    for name in RUN_ENTRIES:
+        (tmp_path / name).touch()
+        refuses("E-OUTPUT-IS-INPUT … run", keep_apart, [("--json", tmp_path / name)], [("run", tmp_path)])
+    monkeypatch.chdir(tmp_path)
+    refuses("E-OUTPUT-TWICE … --out", keep_apart, [("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
+    refuses("E-OUTPUT-FOLDER … --out", keep_apart, [("--out", tmp_path)], [])
+    for out in (tmp_path / "a", Path("a")):
+        with fails_with(f"E-OUTPUT-IS-INPUT … --out {out}"):
+            keep_apart([("--out", out)], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
+    for name in ("poses.csv", "a.json", "b.HTML", "figure.svg"):
+        (tmp_path / name).write_text("an earlier table")
+        for out in (name, "new.json"):
+            keep_apart([("--out", tmp_path / out)], [("images", tmp_path)])
+        for read in ("a.jpg", "cameras.txt", "points3D.bin", "database.db", "drawing.png"):
+            (tmp_path / read).write_text("mine")
+            refuses("E-OUTPUT-IS-INPUT … images", keep_apart, [("--out", tmp_path / read)], [("images", tmp_path)])
+
+
+def test_numbers_have_both_ends():
+    """A width of 1e20 px, or a distance of 1e308 mm, ends in the numerics; options without a range, and σ of
+    hand-eye, are judged by the stage that they go to."""
+    for command, function in COMMANDS.items():
+        for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+            info = next(each for each in get_args(parameter.annotation) if isinstance(each, ParameterInfo))
+            if command == "handeye" and name.startswith("sigma"):
+                continue
+            assert (info.min is None) == (info.max is None), f"{command}: {name}"

@@ -7,10 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stcal.geometry.plane import mirrored
+from stcal.design import reference_target
+from stcal.geometry.plane import fit_plane, mirrored
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.chain import CalibratedTarget, face_frame
 from stcal.sfm.adjust.faces_file import TargetCircles
 from stcal.sfm.adjust.joint import unmoved
 from stcal.sfm.adjust.uncertainty import derivatives
@@ -103,3 +104,16 @@ def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
     second = mirrored(Poses.of([truth]), towards).rotation[0]
     off = Rigid(pose.camera_from_target.rotation @ second.T).angle_rad()
     return off < float(np.linalg.norm(error[:3]))
+
+
+def true_poses(truth: dict) -> dict[str, Rigid]:
+    """camera_from_target by image of a truth file; its frame is laid by the reference face's circles as a run does."""
+    face = reference_target().face(truth["reference_face"])
+    circles = {c: np.array(truth["circles"][f"{face.id}:{c}"]) for c in face.ids}
+    frame = face_frame(face, circles, "plane", np.array([0, 0, 1.0]))
+    assert fit_plane(np.array(list(circles.values()))).rms < 1e-3
+    return {
+        name: Rigid.from_matrix(image["camera_from_target"]) @ frame
+        for group in truth["groups"].values()
+        for name, image in group["images"].items()
+    }

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.design import reference_target
-from stcal.geometry.rigid import Rigid
+from stcal import Rigid, reference_target
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains
 from stcal.synthetic.scene import SceneOptions, make_scene
@@ -21,22 +20,16 @@ def circles(noise=0.0, seed=0, keep=None):
     return {c: p for c, p in zip(FACE.ids, xyz, strict=True) if keep is None or c in keep}
 
 
-@pytest.mark.parametrize("kind", ["plane", "three-point"])
-def test_both_frames_are_exact_on_exact_circles(kind):
-    frame = face_frame(FACE, circles(), kind, WORLD_FROM_FACE.rotation[:, 2])
-    np.testing.assert_allclose(frame.matrix(), WORLD_FROM_FACE.matrix(), atol=1e-12)
-
-
-def test_the_plane_frame_spreads_less():
+def test_frames_are_exact_on_exact_circles_and_that_of_the_plane_spreads_less():
     """Z of ten circles against Z of three, with the same noise."""
+    for kind in ("plane", "three-point"):
+        frame = face_frame(FACE, circles(), kind, WORLD_FROM_FACE.rotation[:, 2])
+        np.testing.assert_allclose(frame.matrix(), WORLD_FROM_FACE.matrix(), atol=1e-12)
     spread, up = {}, WORLD_FROM_FACE.rotation[:, 2]
     for kind in ("plane", "three-point"):
         along = [face_frame(FACE, circles(0.01, s), kind, up).rotation[:, 2] @ up for s in range(200)]
         spread[kind] = np.sqrt(np.mean(np.arccos(np.minimum(along, 1.0)) ** 2))
     assert 0.3 < spread["plane"] / spread["three-point"] < 0.8
-
-
-def test_a_missing_frame_circle_is_named():
     with fails_with("E-FACE-FRAME-CIRCLES … 1:3 and 1:5"):
         face_frame(FACE, circles(keep="12467abc"), "plane", np.array([0, 0, 1.0]))
 
@@ -62,16 +55,14 @@ FACES = [in_group(g, f) for g, pair in (("a", "12"), ("b", "14"), ("c", "23")) f
 ERROR = [0, 0, 0, 0.0, 0.03, 0.0]
 
 
-def test_exact_groups_chain_exactly_and_another_reference_face_moves_the_frame_alone():
+def test_exact_groups_chain_exactly_and_two_ways_of_few_faces_are_combined_by_weight():
+    """Another reference face moves the frame alone."""
     one, two = chain_faces(FACES, TARGET, "1"), chain_faces(FACES, TARGET, "2")
     for face_id, pose in TRUE.items():
         np.testing.assert_allclose(one.target_from_face[face_id].matrix(), pose.matrix(), atol=1e-9)
         moved = two.target_from_face["1"] @ one.target_from_face[face_id]
         np.testing.assert_allclose(moved.matrix(), two.target_from_face[face_id].matrix(), atol=1e-9)
     np.testing.assert_allclose(one.circles["3:2"], TRUE["3"] @ [40.0, 0, 0], atol=1e-9)
-
-
-def test_two_ways_to_a_face_are_combined_and_their_disagreement_is_told():
     faces = [*FACES, in_group("d", "3", ERROR), in_group("d", "4")]
     target = chain_faces(faces, TARGET, "1")
     shift = target.target_from_face["3"].translation - TRUE["3"].translation
@@ -79,6 +70,15 @@ def test_two_ways_to_a_face_are_combined_and_their_disagreement_is_told():
     ways = measure_chains(faces, target)["3"]
     assert {way.groups for way in ways} == {("a", "c"), ("b", "d")}
     assert sum(way.translation_mm for way in ways) == pytest.approx(0.03, rel=0.2)
+    faces = [in_group(*own, weight=100) for own in ("a1", "a2", "b1")] + [in_group("b", "2", ERROR, weight=1)]
+    shift = chain_faces(faces, TARGET, "1").target_from_face["2"].translation - TRUE["2"].translation
+    assert np.linalg.norm(shift) < 0.003
+    pairs = {"a": "12", "b": "14", "c": "24", "d": "23"}
+    expected = {"2": {"a", "bc"}, "3": {"ad", "bcd"}, "4": {"b", "ac"}}
+    assert ways_by(pairs) == expected
+    assert ways_by(dict(reversed(pairs.items()))) == expected  # whatever the order of the groups
+    pairs["e"] = "34"
+    assert ways_by(pairs) == {"2": {"a", "bc"}, "3": {"ad", "be", "bcd", "ace"}, "4": {"b", "ac"}}
 
 
 def ways_by(pairs: dict[str, str]) -> dict[str, set[str]]:
@@ -88,22 +88,7 @@ def ways_by(pairs: dict[str, str]) -> dict[str, set[str]]:
     return {face: {"".join(way.groups) for way in own} for face, own in ways.items()}
 
 
-def test_ways_have_at_most_one_face_more_than_the_shortest():
-    pairs = {"a": "12", "b": "14", "c": "24", "d": "23"}
-    expected = {"2": {"a", "bc"}, "3": {"ad", "bcd"}, "4": {"b", "ac"}}
-    assert ways_by(pairs) == expected
-    assert ways_by(dict(reversed(pairs.items()))) == expected  # whatever the order of the groups
-    pairs["e"] = "34"
-    assert ways_by(pairs) == {"2": {"a", "bc"}, "3": {"ad", "be", "bcd", "ace"}, "4": {"b", "ac"}}
-
-
-def test_a_better_fixed_face_weighs_more():
-    faces = [in_group(*own, weight=100) for own in ("a1", "a2", "b1")] + [in_group("b", "2", ERROR, weight=1)]
-    shift = chain_faces(faces, TARGET, "1").target_from_face["2"].translation - TRUE["2"].translation
-    assert np.linalg.norm(shift) < 0.003
-
-
-def test_faces_that_no_group_links_are_left_out_with_the_remedy(labels_only):
+def test_faces_that_no_group_links_are_left_out_and_the_reference_face_must_be_there(labels_only):
     pairs = (("1", "2"), ("3", "4"))
     scene = make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=2, groups=pairs))
     found = calibrated(scene, labels_only, (), solve="chain")
@@ -111,9 +96,6 @@ def test_faces_that_no_group_links_are_left_out_with_the_remedy(labels_only):
     for face_id in "34":
         start = f"face {face_id}: left out, never linked to reference face 1; add a group that shows"
         assert sum(note.startswith(start) for note in found.notes) == 1
-
-
-def test_the_reference_face_must_be_there_and_linked_to_all():
     faces = [in_group(*own) for own in ("a1", "a2", "b3", "b4")]
     refuses("E-FACE-UNLINKED … 3, 4 … 1", chain_faces, faces, TARGET, "1")
     refuses("E-FACE-REFERENCE … 5", chain_faces, faces[:2], TARGET, "5")

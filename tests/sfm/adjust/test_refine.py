@@ -1,4 +1,5 @@
-"""One group: its free network against the same equations in full, score tests, weights, and λ from the board."""
+"""One group: its free network against the same equations in full, score tests, weights, and λ from the board. Rims in
+front of circles, from the change of their radii with tilt, and faces of the surface behind them."""
 
 from dataclasses import replace
 
@@ -6,13 +7,25 @@ import numpy as np
 import pytest
 from scipy.special import chdtrc
 
+from stcal.boards.board_file import board_toml, load_board
+from stcal.boards.target_file import load_target, target_toml
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import CircleLabel, DotLabel
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.equations import GroupPart, Setting
+from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import adjust, find_scale, free_network, solve_score
+from stcal.sfm.adjust.rims import RadiusViews, Rim, _rim, find_rims, lost_radius_mm
+from stcal.sfm.checks.board_checks import rim_check
 from stcal.sfm.data.group_model import WorldModel
+from stcal.sfm.detect.candidates import EllipseOptions
+from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.labelling import label_single
+from stcal.sfm.planning.forecast import observe, true_models
+from stcal.sfm.runs.run_options import RunOptions
+from stcal.synthetic.render import RenderOptions, render
+from tests.levels import sampled
 from tests.outcome import fails_with
 
 NOISE_PX, FACTOR = 0.01, 1.3
@@ -64,8 +77,9 @@ def full(group):
     return jacobian, np.linalg.inv(bordered)[:size, :size]
 
 
-def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations(network, full, group):
-    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown."""
+def test_covariance_and_redundancy_are_those_of_the_full_equations_and_squares_are_chi_square(network, full, group):
+    """Diagonal of 1 − J C Jᵀ, both coordinates of an observation; in all, what is not unknown. Of 1000 draws of noise
+    as many are beyond the quantile of one in a thousand as there should be."""
     p = 3 * len(group[0].labels)
     scale = np.sqrt(np.diag(network.covariance_mm2))
     np.testing.assert_allclose(
@@ -82,60 +96,6 @@ def test_covariance_of_the_points_and_redundancy_are_those_of_the_full_equations
     assert len(square) == len(group[0].images)
     assert network.noise() == 1.0  # σ that are as stated are never made smaller
     assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0
-
-
-def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, group):
-    """One more column in the full equations: its σ is the score's, and so is its estimate."""
-    model, rng = group[0], np.random.default_rng(0)
-    column = rng.normal(size=(len(model.image_index), 2, 1))
-    test = solve_score(*network.score(column))
-    wider = np.column_stack([full[0], column.reshape(-1)])
-    estimate = np.linalg.lstsq(wider, network.residual.reshape(-1), rcond=1e-9)[0][-1]
-    left = column.reshape(-1) - full[0] @ np.linalg.lstsq(full[0], column.reshape(-1), rcond=1e-9)[0]
-    assert test.covariance[0, 0] == pytest.approx(1 / (left @ left), rel=1e-4)
-    assert test.estimate[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(test.covariance[0, 0]))
-    assert test.freedom == 1
-    assert test.statistic == pytest.approx(test.estimate[0] ** 2 / test.covariance[0, 0])
-
-
-def test_what_an_image_explains_is_what_leaving_it_out_changes(network):
-    """One parameter for each of its coordinates, by the general equations and by those of one image."""
-    image = 3
-    rows = np.flatnonzero(network.model.image_index == image)
-    k = np.arange(len(rows))
-    columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
-    columns[rows, 0, k] = columns[rows, 1, len(rows) + k] = 1
-    normal, right = network.score_of_image(image)
-    general = network.score(columns)
-    np.testing.assert_allclose(normal, general[0], atol=1e-9)
-    np.testing.assert_allclose(right, general[1], atol=1e-9)
-
-
-def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
-    """One image's focal length 1e-3 longer: eleven times its σ there."""
-    model, camera = group
-    image = 1
-    own = model.image_index == image
-    stretched = model.measured_px.copy()
-    stretched[own] += 1e-3 * (stretched[own] - camera.centre)
-    network = free_network(adjust(replace(model, measured_px=stretched), camera), camera)
-    columns = network.model.whiten(network.model.corrected_px() - camera.centre)[:, :, None]
-    normal, right = network.score_by_image(columns)
-    statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]
-    assert np.argmax(statistics) == image
-    assert solve_score(normal[image], right[image]).estimate[0] == pytest.approx(1e-3, rel=0.05)
-
-
-def test_directions_without_information_count_for_nothing():
-    normal = np.array([[2.0, 2.0], [2.0, 2.0]])
-    test = solve_score(normal, np.array([1.0, 1.0]))
-    assert test.freedom == 1
-    assert test.statistic == pytest.approx(0.5)
-    assert normal @ test.estimate == pytest.approx([1.0, 1.0])
-
-
-def test_squares_of_observations_are_chi_square(network, full):
-    """Of 1000 draws of noise: as many beyond the quantile of one in a thousand as there should be."""
     jacobian, cofactor = full
     projector = np.eye(len(jacobian)) - jacobian @ cofactor @ jacobian.T
     rng, beyond, count = np.random.default_rng(4), 0, 0
@@ -149,7 +109,47 @@ def test_squares_of_observations_are_chi_square(network, full):
     assert 0.8 < beyond / (1e-3 * count) < 1.25
 
 
-def test_weights_are_hubers_and_the_cost_is_theirs(group):
+def test_scores_are_estimates_beside_all_others_and_find_a_fault_where_it_is(network, full, group):
+    """By the general equations, and by those of one image of one parameter for each of its coordinates. One image's
+    focal length 1e-3 longer is eleven times its σ there."""
+    model, rng = group[0], np.random.default_rng(0)
+    column = rng.normal(size=(len(model.image_index), 2, 1))
+    test = solve_score(*network.score(column))
+    wider = np.column_stack([full[0], column.reshape(-1)])
+    estimate = np.linalg.lstsq(wider, network.residual.reshape(-1), rcond=1e-9)[0][-1]
+    left = column.reshape(-1) - full[0] @ np.linalg.lstsq(full[0], column.reshape(-1), rcond=1e-9)[0]
+    assert test.covariance[0, 0] == pytest.approx(1 / (left @ left), rel=1e-4)
+    assert test.estimate[0] == pytest.approx(estimate, rel=1e-3, abs=1e-4 * np.sqrt(test.covariance[0, 0]))
+    assert test.freedom == 1
+    assert test.statistic == pytest.approx(test.estimate[0] ** 2 / test.covariance[0, 0])
+    image = 3
+    rows = np.flatnonzero(network.model.image_index == image)
+    k = np.arange(len(rows))
+    columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
+    columns[rows, 0, k] = columns[rows, 1, len(rows) + k] = 1
+    normal, right = network.score_of_image(image)
+    general = network.score(columns)
+    np.testing.assert_allclose(normal, general[0], atol=1e-9)
+    np.testing.assert_allclose(right, general[1], atol=1e-9)
+    normal = np.array([[2.0, 2.0], [2.0, 2.0]])
+    test = solve_score(normal, np.array([1.0, 1.0]))
+    assert test.freedom == 1
+    assert test.statistic == pytest.approx(0.5)
+    assert normal @ test.estimate == pytest.approx([1.0, 1.0])
+    model, camera = group
+    image = 1
+    own = model.image_index == image
+    stretched = model.measured_px.copy()
+    stretched[own] += 1e-3 * (stretched[own] - camera.centre)
+    network = free_network(adjust(replace(model, measured_px=stretched), camera), camera)
+    columns = network.model.whiten(network.model.corrected_px() - camera.centre)[:, :, None]
+    normal, right = network.score_by_image(columns)
+    statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]
+    assert np.argmax(statistics) == image
+    assert solve_score(normal[image], right[image]).estimate[0] == pytest.approx(1e-3, rel=0.05)
+
+
+def test_weights_are_hubers_and_costs_are_theirs_and_those_of_dots_off_their_design(group):
     """Weight 1 within the limit and limit/length beyond; the cost's derivative by a residual is 2 w r."""
     model, camera = group
     far = model.measured_px.copy()
@@ -170,9 +170,6 @@ def test_weights_are_hubers_and_the_cost_is_theirs(group):
     turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
     assert equations.image_cost(replace(model, camera_from_model=turned), camera, 4.0) == np.inf  # behind them
     assert gradient == pytest.approx(2 * weights[5] * by_x @ equations.normalised(model, camera)[5], rel=1e-5)
-
-
-def test_dots_off_their_design_cost_their_squares_over_sigma(group):
     model, camera = group
     (dot_rows,) = np.nonzero([isinstance(label, DotLabel) for label in model.labels])
     (circle_rows,) = np.nonzero([isinstance(label, CircleLabel) for label in model.labels])
@@ -211,26 +208,20 @@ def board_xyz():
     return np.column_stack([BOARD.xy_mm(), np.zeros(63)])
 
 
-@pytest.mark.parametrize("missing", [0, 5])
-def test_both_scales_are_exact_without_noise_whichever_dots_are_missing(missing):
-    keep = [i for i in range(63) if not missing or i % missing]
-    scale = find_scale(model_of(board_xyz()[keep], [BOARD.labels()[i] for i in keep]), BOARD)
-    assert scale.mm_per_unit == pytest.approx(25.0, rel=1e-12)
-    # The mean over pairs, 2/(n(n−1)): the printed 1/(n−1)! would give a number near zero.
-    assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
-    assert scale.rows == (0, 6)
-    assert scale.rms_mm() < 1e-10
-
-
-def test_rows_use_the_first_and_the_last_mapped_row_only():
+def test_scales_are_exact_without_noise_and_follow_the_boards_sigma():
+    for missing in (0, 5):
+        keep = [i for i in range(63) if not missing or i % missing]
+        scale = find_scale(model_of(board_xyz()[keep], [BOARD.labels()[i] for i in keep]), BOARD)
+        assert scale.mm_per_unit == pytest.approx(25.0, rel=1e-12)
+        # The mean over pairs, 2/(n(n−1)): the printed 1/(n−1)! would give a number near zero.
+        assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
+        assert scale.rows == (0, 6)
+        assert scale.rms_mm() < 1e-10
     xyz = board_xyz()
     xyz[9:54] += np.random.default_rng(0).normal(0, 1, (45, 3))  # the rows between are far off
     scale = find_scale(model_of(xyz, BOARD.labels()), BOARD)
     assert scale.rows_mm_per_unit == pytest.approx(25.0, rel=1e-12)
     assert abs(scale.mm_per_unit / 25 - 1) > 1e-6
-
-
-def test_residuals_and_the_spread_of_lambda_follow_the_boards_sigma():
     rng = np.random.default_rng(0)
     ratios, residuals = [], []
     for _ in range(300):
@@ -240,10 +231,115 @@ def test_residuals_and_the_spread_of_lambda_follow_the_boards_sigma():
     assert 0.85 < np.std(ratios) < 1.15  # 300 draws: ± 4 %
     # 189 coordinates less 7 parameters: 5 µm · √3 · √(182/189).
     assert np.mean(residuals) == pytest.approx(0.0085, rel=0.03)
+    for keep, reason in ((range(3), "E-SCALE-FEW-DOTS … 3 … 4"), (range(9), "E-SCALE-COLLINEAR")):
+        labels = [BOARD.labels()[i] for i in keep]
+        with fails_with(reason):
+            find_scale(model_of(board_xyz()[list(keep)], labels), BOARD)
 
 
-@pytest.mark.parametrize(("keep", "reason"), [(range(3), "E-SCALE-FEW-DOTS … 3 … 4"), (range(9), "E-SCALE-COLLINEAR")])
-def test_too_little_of_the_board(keep, reason):
-    labels = [BOARD.labels()[i] for i in keep]
-    with fails_with(reason):
-        find_scale(model_of(board_xyz()[list(keep)], labels), BOARD)
+@pytest.fixture(scope="module")
+def scene(small_scene):
+    return small_scene
+
+
+def rim_of(short, tangent, radius, blur, image) -> Rim:
+    """The rim of 240 circles whose light is even."""
+    none, index = np.zeros(240), np.arange(240)
+    return _rim(RadiusViews(index, image, radius, 1 + short / radius, none, blur, tangent, np.zeros((240, 2)), none))
+
+
+def rims_of(scene, rim_mm, **look):
+    images = []
+    for i in range(4):
+        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, clutter=False, **look))
+        found = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
+        images.append(label_single(f"12/{i:04d}", "12", found, scene.target).observations)
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    return find_rims(true_models(scene, images), images, radius, scene.camera)
+
+
+@pytest.mark.parametrize("rim_mm", sampled([0.3, 0.15]))
+def test_the_height_of_a_rim_is_found(scene, rim_mm):
+    """Within 10 %, as the area of the lens-shaped image is that of an ellipse to second order alone, and within 3 σ."""
+    rim = rims_of(scene, rim_mm)["circles"]
+    assert rim.height_mm == pytest.approx(rim_mm, abs=0.1 * rim_mm + 3 * rim.sigma_mm)
+    assert rim.height_mm > 4 * rim.sigma_mm
+    check = rim_check({"circles": rim}, 0.002, {})
+    assert check.verdict == "suspicious"
+    assert "in front of the luminous surface" in check.reason
+    assert rim_check({"circles": rim}, 0.002, {"circles": rim_mm}).verdict == "passed"
+
+
+@pytest.mark.parametrize("look", sampled([{}, {"fade": 0.25}, {"fade": 0.25, "blur_px": 1.2}], kept=(2,)))
+def test_no_rim_is_found_where_there_is_none(scene, look):
+    """Nor where discs have a quarter less light at their rim, which makes them look smaller."""
+    rims = rims_of(scene, 0.0, **look)
+    assert abs(rims["circles"].height_mm) < 3 * rims["circles"].sigma_mm
+    assert rim_check(rims, 0.002, {}).verdict == "passed"
+
+
+def test_rims_that_harm_nothing_are_no_fault_need_the_joint_adjustment_and_are_stated_by_designs(scene, tmp_path):
+    """It is seen with certainty, and moves faces by less than their σ."""
+    assert rim_check({}, 0.002, {}).verdict == "not possible"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02, {}).verdict == "passed"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002, {}).verdict == "suspicious"
+    for options, refusal in (
+        ({"solve": "chain", "rim": True}, "E-RIM-SOLVE … --solve joint"),
+        ({"solve": "paper", "rim": True}, "E-RIM-SOLVE … --solve joint"),
+        ({"solve": "chain", "refine_camera": True}, "E-OPTION-NEEDS … --solve"),
+    ):
+        with fails_with(refusal):
+            RunOptions(**options).settled(scene.target)
+        assert RunOptions(rim=True).settled(scene.target).rim
+    face = scene.target.faces[0]
+    heights = np.where(np.arange(len(face.ids)) == 2, -0.1, 0.25)
+    target = replace(scene.target, faces=(replace(face, rim_mm=heights), *scene.target.faces[1:]))
+    (tmp_path / "target.toml").write_text(target_toml(target), encoding="utf-8")
+    read = load_target(tmp_path / "target.toml")
+    np.testing.assert_array_equal(read.faces[0].rim_mm, heights)
+    assert read.faces[1].rim_mm is None
+    assert read.rim_of() == dict(zip(face.labels(), heights.tolist(), strict=True))
+    board = replace(scene.board, rim_mm=0.3)
+    (tmp_path / "board.toml").write_text(board_toml(board), encoding="utf-8")
+    assert load_board(tmp_path / "board.toml").rim_mm == 0.3
+    rims = {"dots": Rim(0.31, 0.01, 500)}
+    assert "the board lies 0.155 mm in front of" in rim_check(rims, 0.002, {}).reason
+    passed = rim_check(rims, 0.002, {"dots": board.rim_mm})
+    assert passed.verdict == "passed"
+    assert "0.3 mm stated" in passed.reason
+
+
+def test_a_rim_hides_what_is_not_in_common_of_two_discs_and_rims_of_dots_move_the_board_alone(scene):
+    """Of the radius by area. That of the fit, which follows the rim, is less by up to 2 %."""
+    apart = np.array([0.05, 0.1, 0.15])
+    area = 2 * np.arccos(apart / 2) - apart / 2 * np.sqrt(4 - apart**2)
+    np.testing.assert_allclose(lost_radius_mm(0.1, 10 * 5.0 * apart, 5.0) / 5.0, 1 - np.sqrt(area / np.pi), rtol=0.02)
+    models = true_models(scene, observe(scene, 0.01, np.random.default_rng(0)))
+    seen, surface = (adjusted(models, replace(scene.board, rim_mm=h), scene.camera).result() for h in (0.0, 0.3))
+    np.testing.assert_allclose(surface.xyz_model, seen.xyz_model, atol=1e-6)
+    moved = surface.model_from_board["12"].translation - seen.model_from_board["12"].translation
+    np.testing.assert_allclose(moved, 0.15 * seen.model_from_board["12"].rotation[:, 2], atol=1e-6)
+
+
+def test_a_blur_corrected_by_too_little_is_no_rim_and_errors_common_to_an_image_are_in_sigma():
+    """Radii that blur makes smaller, by a fifth more than is put back, in views of other tilts and distances. Then
+    twelve images of one tilt each, of 20 circles: a common error as large as that of single circles. With σ of
+    independent circles, and the least σ of a rim, the mean square is 2.6."""
+    for height_mm in (0.0, 0.05):
+        rng = np.random.default_rng(3)
+        tangent, distance = rng.uniform(0.1, 2.0, 240), rng.uniform(0.8, 1.4, 240)
+        radius = np.where(np.arange(240) % 2, 4.0, 8.0)
+        blur = 0.02 * distance**2 / radius * 6 * np.sqrt(1 + tangent**2)
+        noise = rng.normal(0, 0.003, 240)
+        short = noise + 0.2 * blur - lost_radius_mm(height_mm, tangent, radius)
+        rim = rim_of(short, tangent, radius, blur, np.arange(240))
+        assert rim.height_mm == pytest.approx(height_mm, abs=2.5 * rim.sigma_mm)
+        assert 0.003 < rim.sigma_mm < 0.0125  # of 0.05 mm at four σ
+    rng, normed = np.random.default_rng(5), []
+    for _ in range(100):
+        image = np.repeat(np.arange(12), 20)
+        tangent, common = rng.uniform(0.1, 2.0, 12)[image], rng.normal(0, 0.003, 12)[image]
+        rim = rim_of(common + rng.normal(0, 0.003, 240), tangent, np.full(240, 8.0), np.zeros(240), image)
+        normed.append(rim.height_mm / rim.sigma_mm)
+    assert 0.5 < np.mean(np.square(normed)) < 2.0
+    assert np.mean(np.abs(normed) > 4) <= 0.01

@@ -12,12 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from stcal import camera_prior, reference_board
 from stcal.boards.board_designs import CharucoDesign
-from stcal.design import reference_board
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.plane import circle_image_offset
-from stcal.io.cameras.camera_model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera import intrinsics
@@ -93,16 +92,13 @@ def test_truth_within_predicted_sigma(field_px, count, low, high):
         assert 0.05 < result.sigma()[0] < 0.2
 
 
-def test_sigma_follows_what_the_centres_do():
+def test_sigma_follows_what_the_centres_do_and_a_bad_dot_is_weighed_down():
     # Centres five times as bad as they say: found out, and σ grow as much.
     views = views_of(np.random.default_rng(5), noise_px=0.1)
     honest = calibrated(views)
     boastful = calibrated([replace(v, covariance_px2=v.covariance_px2 / 25) for v in views])
     assert boastful.factors.centres == pytest.approx(5 * honest.factors.centres, rel=0.02)
     assert boastful.sigma() == pytest.approx(honest.sigma(), rel=0.05)
-
-
-def test_a_bad_dot_is_weighed_down():
     views = views_of(np.random.default_rng(6))
     shifted = views[3].centre_px + 1.0 * (np.arange(len(views[3])) == 7)[:, None]
     spoilt = calibrated([*views[:3], replace(views[3], centre_px=shifted), *views[4:]])
@@ -114,14 +110,12 @@ def test_a_bad_dot_is_weighed_down():
     assert named == ("3.jpg", views[3].labels[7])
 
 
-def test_a_model_of_fewer_parameters():
+def test_models_of_fewer_and_of_more_parameters():
+    """The rational model knows projections, though not its coefficients."""
     camera = replace(TRUE, focal=[2790.0, 2790.0], distortion=[-0.1, *[0] * 7])
     result = calibrated(views_of(np.random.default_rng(7), camera=camera), "SIMPLE_RADIAL")
     e = error(result, camera)
     assert 0.01 < e @ np.linalg.solve(result.covariance, e) / chi2.ppf(0.999, len(e)) < 1
-
-
-def test_rational_model_knows_projections_though_not_its_coefficients():
     result = calibrated(views_of(np.random.default_rng(8)), "FULL_OPENCV")
     sigma = projection_sigma(result)
     moved = np.abs(result.camera.project(RAYS) - TRUE.project(RAYS)).max()
@@ -131,7 +125,7 @@ def test_rational_model_knows_projections_though_not_its_coefficients():
     assert 0.001 < moved < 0.5
 
 
-def test_intrinsics_that_are_held_stay_and_the_poses_follow():
+def test_intrinsics_that_are_held_stay_and_closed_form_finds_the_focal_length_else_several_are_tried(monkeypatch):
     wrong = replace(TRUE, focal=[2795.0, 2784.0])
     views = views_of(np.random.default_rng(8), count=6)
     held = adjust_intrinsics(views, BOARD, wrong, "OPENCV", held=True)
@@ -140,9 +134,6 @@ def test_intrinsics_that_are_held_stay_and_the_poses_follow():
     assert (np.abs(error(free)) < 5 * free.sigma()).all()
     # 5 px of 2790 are 1 px at the edge of a board that fills the image, and some of it no pose can take up.
     assert np.sqrt((held.residuals_px() ** 2).mean()) > 2 * np.sqrt((free.residuals_px() ** 2).mean())
-
-
-def test_closed_form_finds_the_focal_length_and_where_it_gives_none_several_are_tried(monkeypatch):
     # Exact but for the eccentricity of the dots, and the principal point 6 px off the middle; then with distortion.
     pinhole = replace(TRUE, focal=[2790.0, 2790.0], distortion=np.zeros(8))
     start = intrinsics.start_camera(TRUE.width, TRUE.height, "OPENCV")
@@ -158,21 +149,37 @@ def test_closed_form_finds_the_focal_length_and_where_it_gives_none_several_are_
 BENT = replace(TRUE, distortion=[-0.3, 0.1, 0, 0, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize(
-    ("shown", "model", "refusal"),
-    [
+def test_what_cannot_be_calibrated_is_refused_and_why(stcal_sfm, small_dataset, tmp_path, small_set):
+    for shown, model, refusal in (
         ({"count": 6, "tilt_deg": 0.02}, "OPENCV", "E-CALIBRATE-UNDETERMINED … 6 … 2 %"),
         ({"camera": BENT}, "PINHOLE", "E-CALIBRATE-MISFIT … PINHOLE puts them … use --model OPENCV"),
-    ],
-)
-def test_boards_of_one_direction_and_a_model_that_does_not_fit_are_refused(shown, model, refusal):
-    views = views_of(np.random.default_rng(2), **shown)
-    with fails_with(refusal):
-        require_determined(calibrated(views, model), views, BOARD)
+    ):
+        views = views_of(np.random.default_rng(2), **shown)
+        with fails_with(refusal):
+            require_determined(calibrated(views, model), views, BOARD)
+    words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
+    ended = stcal_sfm(*words)
+    assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((300, 400), 60 + i, np.uint8))
+    code, _, message = stcal_sfm("calibrate-camera", tmp_path / "images", "--out", tmp_path / "c.txt", "--workers", 1)
+    assert code == 3
+    assert "error: camera: no board recognised in 3 images; 0.png: no board recognised; check the board" in message
+    assert not (tmp_path / "c.txt").exists()
+    own = small_set("12", detected=False)
+    own.image(3).unlink()
+    cv2.imwrite(str(own.image(2)), np.zeros((400, 600), np.uint8))
+    out = own.folder / "c.txt"
+    code, _, message = stcal_sfm("calibrate-camera", own.images, "--out", out, "--workers", 1)
+    assert code == 3
+    assert "2 of 3 images show the board, 3 needed" in message
+    assert "12/IMG_1002.jpg: 600×400 px, but the majority of the images says 1296×864 px" in message
 
 
-def test_sigma_cover_a_changed_focus():
-    """Half of the views with another focal length: no error of any pixel, and σ cover both."""
+def test_sigma_cover_a_changed_focus_and_a_loud_photograph_hardly_counts():
+    """Half of the views with another focal length: no error of any pixel, and σ cover both. A loud photograph moves the
+    answer by 2.5 σ where it counts; else by 0.3 to 0.6 σ, and σ by −7 to +26 %, in four draws."""
     rng = np.random.default_rng(3)
     made = np.column_stack([BOARD.xy_mm(), np.zeros(63)])
     refocused = replace(TRUE, focal=1.002 * TRUE.focal)
@@ -183,6 +190,13 @@ def test_sigma_cover_a_changed_focus():
     assert 0.2 < result.sigma()[0] / (0.002 * 2790 / np.sqrt(12)) < 2  # of a mean of twelve, which two kinds are
     lines = calibration._warnings(result, projection_sigma(result), BOARD)
     assert any("photographs differ" in line for line in lines)
+    rng = np.random.default_rng(3)
+    views = views_of(rng, 14)
+    loud = with_a_field(views[3:4], rng, 8 * 0.02)
+    sound, all_of_them = calibrated([*views[:3], *views[4:]]), calibrated([*views[:3], *loud, *views[4:]])
+    apart = [model_parameters(each.camera, "OPENCV") for each in (all_of_them, sound)]
+    assert np.abs(np.subtract(*apart) / sound.sigma()).max() < 1
+    assert all_of_them.sigma() / sound.sigma() == pytest.approx(1, abs=0.25)
 
 
 def with_a_field(views, rng, sigma_px: float, length_px: float = 250.0):
@@ -193,17 +207,6 @@ def with_a_field(views, rng, sigma_px: float, length_px: float = 250.0):
         root = np.linalg.cholesky(np.exp(-apart / 2 / length_px**2) + 1e-9 * np.eye(len(view)))
         moved.append(replace(view, centre_px=view.centre_px + sigma_px * root @ rng.standard_normal((len(view), 2))))
     return moved
-
-
-def test_a_loud_photograph_hardly_counts():
-    """It moves the answer by 2.5 σ where it counts; else by 0.3 to 0.6 σ, and σ by −7 to +26 %, in four draws."""
-    rng = np.random.default_rng(3)
-    views = views_of(rng, 14)
-    loud = with_a_field(views[3:4], rng, 8 * 0.02)
-    sound, all_of_them = calibrated([*views[:3], *views[4:]]), calibrated([*views[:3], *loud, *views[4:]])
-    apart = [model_parameters(each.camera, "OPENCV") for each in (all_of_them, sound)]
-    assert np.abs(np.subtract(*apart) / sound.sigma()).max() < 1
-    assert all_of_them.sigma() / sound.sigma() == pytest.approx(1, abs=0.25)
 
 
 STRETCHED = {"along": [[1.0, 0.0], [0.0, 0.0]], "across": [[0.0, 0.0], [0.0, 1.0]], "sheared": [[0.0, 0.5], [0.5, 0.0]]}
@@ -231,17 +234,14 @@ def test_a_stretched_print_moves_the_focal_lengths_within_their_sigma(board, cou
     assert 0.5 < np.mean(squares) < most
 
 
-@pytest.mark.parametrize("groups", [("a", "b", "c", "d", "e"), ("a", "b", "b", "b", "b")])
-def test_photographs_each_alone_in_their_group_are_of_one_board(groups):
+def test_photographs_each_alone_in_their_group_and_a_board_upside_down_are_of_one_board():
     """A board of its own in each would explain every photograph, whatever the centres' errors are."""
-    views = views_of(np.random.default_rng(8), len(groups))
-    result = calibrated([replace(view, group=group) for view, group in zip(views, groups, strict=True)])
-    one = calibrated([replace(view, group="b") for view in views])
-    assert len(result.models) == 1
-    assert error(result) == pytest.approx(error(one), abs=1e-3 * one.sigma().max())
-
-
-def test_a_board_upside_down_is_numbered_like_the_others():
+    for groups in (("a", "b", "c", "d", "e"), ("a", "b", "b", "b", "b")):
+        views = views_of(np.random.default_rng(8), len(groups))
+        result = calibrated([replace(view, group=group) for view, group in zip(views, groups, strict=True)])
+        one = calibrated([replace(view, group="b") for view in views])
+        assert len(result.models) == 1
+        assert error(result) == pytest.approx(error(one), abs=1e-3 * one.sigma().max())
     rng = np.random.default_rng(4)
     images, truth = [], []
     for i, view in enumerate(views_of(rng, noise_px=0.005)):
@@ -286,30 +286,6 @@ def test_photographs_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small
     assert 2 <= summary["rounds"] <= 3  # detected again with the camera found
     # Views that keep to the middle: their corners are extrapolated, and the report says so.
     assert any("no dots near the corner" in warning for warning in summary["warnings"])
-
-
-def test_an_unknown_model_and_images_without_a_board_are_refused(stcal_sfm, small_dataset, tmp_path):
-    words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
-    ended = stcal_sfm(*words)
-    assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
-    (tmp_path / "images").mkdir()
-    for i in range(3):
-        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((300, 400), 60 + i, np.uint8))
-    code, _, message = stcal_sfm("calibrate-camera", tmp_path / "images", "--out", tmp_path / "c.txt", "--workers", 1)
-    assert code == 3
-    assert "error: camera: no board recognised in 3 images; 0.png: no board recognised; check the board" in message
-    assert not (tmp_path / "c.txt").exists()
-
-
-def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
-    own = small_set("12", detected=False)
-    own.image(3).unlink()
-    cv2.imwrite(str(own.image(2)), np.zeros((400, 600), np.uint8))
-    out = own.folder / "c.txt"
-    code, _, message = stcal_sfm("calibrate-camera", own.images, "--out", out, "--workers", 1)
-    assert code == 3
-    assert "2 of 3 images show the board, 3 needed" in message
-    assert "12/IMG_1002.jpg: 600×400 px, but the majority of the images says 1296×864 px" in message
 
 
 @pytest.mark.parametrize(("bow_mm", "spread", "count", "factor"), [(0.3, 1.0, 12, 1.0), (0.0, 0.4, 20, 0.45)])

@@ -107,9 +107,11 @@ def test_the_planted_cause_is_named_first(few, lab, name):
     assert check.remedy
 
 
-def test_the_size_of_the_cause_is_said_and_no_file_is_wrong_where_there_is_none(few, lab, monkeypatch):
+def test_the_size_of_the_cause_is_said_no_file_is_wrong_where_there_is_none_and_centroids_are_named(
+    few, lab, monkeypatch
+):
     """Nor is a cause named that leaves more of the residuals than is allowed, as beside a group that is found out. A
-    check that would name nearly all images names few."""
+    check that would name nearly all images names few. Centroids come before what they make fail."""
     asked = []
     monkeypatch.setattr(suite, "whole_set_cause", lambda *given: asked.append(given) or whole_set_cause(*given))
     images, camera = PLANTED["focal length long"][0](few, lab.observe(few))
@@ -122,24 +124,25 @@ def test_the_size_of_the_cause_is_said_and_no_file_is_wrong_where_there_is_none(
     other = whole_set_cause(networks, given, moved, from_file=False)
     assert other is None or "camera file" not in other.title
     assert whole_set_cause(networks, given, moved, most_left=0.0) is None
+    check = first(few, lab, centroids(few, lab.observe(few)))
+    assert "eccentricity" in check.title
+    found = float(re.match(r"(-?[\d.]+) ± ", check.reason)[1])
+    assert found == pytest.approx(0, abs=0.2)
 
 
 def shifted(image):
     return replace(image, centre_px=image.centre_px + on_face(image)[:, None] * [0.4, 0])
 
 
-def test_what_one_image_has_is_no_cause_of_the_whole_set(few, lab):
-    """Another place of the target in one, and another focus in one."""
+def test_what_one_image_has_is_no_cause_of_the_whole_set_and_of_two_halves_of_a_group_none_is_named(few, lab):
+    """Another place of the target in one, and another focus in one. Where the target stood elsewhere in two of four
+    images, that it moved is said, and that either half may be it."""
     images = [shifted(image) if k == 3 else image for k, image in enumerate(lab.observe(few))]
     check = first(few, lab, images)
     assert check.key != CAUSE
     assert check.names[0] == images[3].name
     refocused, _ = zoomed(lambda _, k: 0.01 * (k == 5))(few, lab.observe(few))
     assert first(few, lab, refocused).key != CAUSE
-
-
-def test_of_two_halves_of_a_group_none_is_named(few, lab):
-    """Two of four images in which the target stood elsewhere: that it moved is said, and that either half may be it."""
     images = [shifted(image) if k in (0, 1) else image for k, image in enumerate(lab.observe(few))]
     checks = lab.check(few, images)
     best = ranked(list(checks.values()), frozenset(image.name for image in images))[0]
@@ -170,13 +173,6 @@ def centroids(scene, images):
         shift = scene.camera.project(circle_image_offset(xyz, normal, radius)) - scene.camera.project(xyz)
         made.append(replace(image, centre_px=image.centre_px - shift))
     return made
-
-
-def test_centroids_are_named_before_what_they_make_fail(few, lab):
-    check = first(few, lab, centroids(few, lab.observe(few)))
-    assert "eccentricity" in check.title
-    found = float(re.match(r"(-?[\d.]+) ± ", check.reason)[1])
-    assert found == pytest.approx(0, abs=0.2)
 
 
 FAR_OFF = {

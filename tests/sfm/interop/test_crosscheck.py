@@ -172,14 +172,11 @@ def refused(refused_page_and_all, no_page):
     return refused_page_and_all
 
 
-@pytest.mark.usefixtures("no_page")
-def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    outcome = stcal_sfm("crosscheck", own_run)
+def test_programs_that_are_not_there_or_not_colmap(refused, own_run, stcal_sfm, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path))
+        outcome = stcal_sfm("crosscheck", own_run)
     assert_error(outcome, INPUT, "E-COLMAP-PROGRAM", "on the PATH", INSTALL, "--colmap")
-
-
-def test_programs_that_are_not_there_or_not_colmap(refused, tmp_path):
     (tmp_path / "text").write_text("no program")
     for place in (tmp_path / "none", tmp_path / "text"):
         refused(place, INPUT, f"native COLMAP: no program at {place} that can be executed", INSTALL)
@@ -200,10 +197,25 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize("case", FAILURES)
-def test_a_mapper_that_fails(refused, tmp_path, case):
-    mapper, part = FAILURES[case]
-    refused(program(tmp_path, mapper), COMPUTATION, part)
+def test_a_mapper_that_fails_and_what_it_is_given(refused, tmp_path, own_run):
+    """Names of one group, its pair by the database's ids, choices as 0 and 1, an empty folder, no screen."""
+    for case in FAILURES:
+        mapper, part = FAILURES[case]
+        refused(program(tmp_path, mapper), COMPUTATION, part)
+    said = tmp_path / "said"
+    keep = f'printf "%s\\n" "$@" > "{said}"; cat "$list" > "{said}.list"; ls -A "$models" > "{said}.models"'
+    path = program(tmp_path, f'{keep}; echo $QT_QPA_PLATFORM > "{said}.screen"; exit 1')
+    refused(path, COMPUTATION, "ended with code 1")
+    words = said.read_text().split()
+    assert words[0] == "mapper"
+    given = dict(zip(words[1::2], words[2::2], strict=True))
+    assert given["--Mapper.multiple_models"] == "0"
+    assert given["--Mapper.min_num_matches"] == "6"
+    assert len(given) == 6
+    assert (tmp_path / "said.list").read_text().splitlines() == [f"12/IMG_100{i}.jpg" for i in range(4)]
+    assert (tmp_path / "said.models").read_text() == ""
+    assert (tmp_path / "said.screen").read_text() == "offscreen\n"
+    assert not given["--database_path"].startswith(str(own_run))
 
 
 def answers_of(colmap: str) -> str:
@@ -235,24 +247,6 @@ def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     mapper, child = map(int, pids.read_text().split())
     assert has_ended(mapper)
     assert has_ended(child)
-
-
-def test_what_the_mapper_is_given(own_run, refused, tmp_path):
-    """Names of one group, its pair by the database's ids, choices as 0 and 1, an empty folder, no screen."""
-    said = tmp_path / "said"
-    keep = f'printf "%s\\n" "$@" > "{said}"; cat "$list" > "{said}.list"; ls -A "$models" > "{said}.models"'
-    path = program(tmp_path, f'{keep}; echo $QT_QPA_PLATFORM > "{said}.screen"; exit 1')
-    refused(path, COMPUTATION, "ended with code 1")
-    words = said.read_text().split()
-    assert words[0] == "mapper"
-    given = dict(zip(words[1::2], words[2::2], strict=True))
-    assert given["--Mapper.multiple_models"] == "0"
-    assert given["--Mapper.min_num_matches"] == "6"
-    assert len(given) == 6
-    assert (tmp_path / "said.list").read_text().splitlines() == [f"12/IMG_100{i}.jpg" for i in range(4)]
-    assert (tmp_path / "said.models").read_text() == ""
-    assert (tmp_path / "said.screen").read_text() == "offscreen\n"
-    assert not given["--database_path"].startswith(str(own_run))
 
 
 @pytest.mark.slow

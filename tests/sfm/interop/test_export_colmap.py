@@ -1,27 +1,34 @@
-"""Databases and models for other versions of COLMAP and other programs.
-
-Only native COLMAP 3.8 and pycolmap 4.2 run here. The other schemas are compared with what was published: a checksum of
-the description of the empty database that each version made when it was run. Models are read back by COLMAP.
-"""
+"""Databases and models for other versions of COLMAP and other programs. Only native COLMAP 3.8 and pycolmap 4.2 run
+here. The other schemas are compared with what was published: a checksum of the description of the empty database that
+each version made when it was run. Models are read back by COLMAP. A run's faces, circles, σ and cameras are read back
+from every form by the programs that take them."""
 
 import csv
 import hashlib
+import importlib
 import json
 import re
 import shutil
 import sqlite3
 import subprocess
+import xml.etree.ElementTree as ElementTree
 from contextlib import closing
 from importlib import import_module
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
+from stcal.geometry.rigid import Rigid
+from stcal.labels import parse_label
+from stcal.sfm.interop.export import FORMS, export_run
 from stcal.sfm.interop.export_colmap import SCHEMAS, export_database, export_model
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with, refuses
 from tests.shared import own_copy, unsealed_copy
+from tests.support.static_transforms import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 
 export = import_module("stcal.sfm.interop.export_colmap")
 PUBLISHED = {
@@ -113,14 +120,12 @@ def test_the_schema_is_what_the_program_itself_makes(schema, databases, tmp_path
     assert described(databases[schema]) == described(tmp_path / "empty.db")
 
 
-def test_schemas_are_the_published_ones(databases):
-    """Against what was recorded when each version was run; the versions themselves are not here."""
+def test_schemas_are_the_published_ones_all_is_kept_and_pycolmap_makes_the_same_model(databases, small_run, tmp_path):
+    """Against what was recorded when each version was run; the versions themselves are not here. Every row and value of
+    the run's own database, its type and its place. pycolmap brings the older schema back to its own, and finds exactly
+    the same numbers in it."""
     lines = {schema: described(databases[schema]) for schema in PUBLISHED}
     assert {name: hashlib.sha256("\n".join(own).encode()).hexdigest()[:16] for name, own in lines.items()} == PUBLISHED
-
-
-def test_everything_is_kept(databases, small_run):
-    """Every row and value of the run's own database, its type and its place."""
     own = small_run / "colmap/database.db"
     ours = columns_of(own)
     for path in databases.values():
@@ -134,6 +139,16 @@ def test_everything_is_kept(databases, small_run):
         with read_only(path) as opened:
             assert opened.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
             assert opened.execute("PRAGMA foreign_key_check").fetchall() == []
+    names, pair = first_group(small_run)
+    own = small_run / "colmap/database.db"
+    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
+    assert len(ours) >= 80
+    for schema in ("3.8", "3.13"):
+        model = mapped(databases[schema], tmp_path / schema, names, pair)
+        assert model.num_reg_images() == len(names)
+        theirs = points_by_track(model)
+        assert theirs.keys() == ours.keys()
+        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
 def first_group(run) -> tuple[list[str], tuple[int, int]]:
@@ -160,21 +175,7 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
     }
 
 
-def test_pycolmap_makes_the_same_model_of_the_export(small_run, databases, tmp_path):
-    """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
-    names, pair = first_group(small_run)
-    own = small_run / "colmap/database.db"
-    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
-    assert len(ours) >= 80
-    for schema in ("3.8", "3.13"):
-        model = mapped(databases[schema], tmp_path / schema, names, pair)
-        assert model.num_reg_images() == len(names)
-        theirs = points_by_track(model)
-        assert theirs.keys() == ours.keys()
-        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
-
-
-def test_a_refused_export_writes_and_overwrites_nothing(saved, tmp_path):
+def test_a_refused_export_writes_and_overwrites_nothing_nor_a_file_that_appears_meanwhile(saved, tmp_path, monkeypatch):
     (tmp_path / "mine.db").write_text("mine")
     (tmp_path / "link.db").symlink_to(tmp_path / "nowhere")
     before = state_of(tmp_path)
@@ -186,13 +187,10 @@ def test_a_refused_export_writes_and_overwrites_nothing(saved, tmp_path):
     ):
         refuses(error, export_database, saved, tmp_path / out, schema)
     assert state_of(tmp_path) == before
-
-
-def test_a_file_that_appears_meanwhile_is_not_overwritten(saved, tmp_path, monkeypatch):
     place = tmp_path / "out.db"
     monkeypatch.setattr(export, "write_copy", lambda run, made, schema: made.touch() or place.write_text("theirs"))
     refuses("E-OUTPUT-EXISTS", export_database, saved, place, "3.8")
-    assert {path: path.read_text() for path in tmp_path.iterdir()} == {place: "theirs"}
+    assert state_of(tmp_path) == before | {"out.db": hashlib.sha256(b"theirs").hexdigest()}
 
 
 AGAIN_PX = 5e-5
@@ -288,7 +286,7 @@ def test_a_model_that_was_changed_is_refused(small_run, tmp_path):
     assert not (tmp_path / "model").exists()
 
 
-def test_labels_carry_group_and_sigma(exported, known):
+def test_labels_carry_group_and_sigma_but_those_of_a_chained_run(exported, known, own, tmp_path):
     rows = {(row["group"], row["label"]): row for row in labels_of(exported["colmap-txt"])}
     faces = known[0]
     assert {group for group, label in rows if label.startswith("board:")} == {"12", "14"}
@@ -301,9 +299,6 @@ def test_labels_carry_group_and_sigma(exported, known):
         else:
             covariance = np.array(faces["circle_covariance_mm2"][label])
             np.testing.assert_allclose(np.array(sigma, float) ** 2, 1e6 * np.diag(covariance), atol=0.01, rtol=0.01)
-
-
-def test_a_chained_run_has_no_sigma(own, tmp_path):
     faces = json.loads((own / "faces.json").read_text(encoding="utf-8"))
     del faces["circle_covariance_mm2"]
     (own / "faces.json").write_text(json.dumps(faces), encoding="utf-8")
@@ -346,3 +341,127 @@ def test_errors(own, small_run, tmp_path):
     shutil.rmtree(model)
     refused("E-RUN-VERSION … colmap/target_model", own)
     assert list(out.parent.iterdir()) == []
+
+
+AGAIN_MM = 1e-9
+"""Doubles in their shortest text, by way of metres and quaternions."""
+FLOAT_MM = 1e-4
+"""Single precision at a metre: 6e-5 mm."""
+
+
+@pytest.fixture(scope="module")
+def files(small_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("exported")
+    return {name: export_run(small_run, folder / f"box{form.suffix}", name="box").path for name, form in FORMS.items()}
+
+
+@pytest.fixture(scope="module")
+def faces(small_run):
+    return json.loads((small_run / "faces.json").read_text(encoding="utf-8"))
+
+
+def require_frames(statics, faces):
+    """The tree gives every face and every circle where ``faces.json`` has them."""
+    target_from = {"box": Rigid(np.eye(3), np.zeros(3))}
+    for each in statics:
+        target_from[each.child] = target_from[each.parent] @ each.pose
+    for face, matrix in faces["target_from_face"].items():
+        np.testing.assert_allclose(target_from[f"box_{face}"].matrix(), matrix, rtol=0, atol=AGAIN_MM)
+    for label, xyz in faces["circles"].items():
+        own = parse_label(label)
+        np.testing.assert_allclose(target_from[f"box_{own.face}_{own.circle}"].translation, xyz, rtol=0, atol=AGAIN_MM)
+    assert len(target_from) == 1 + len(faces["target_from_face"]) + len(faces["circles"])
+
+
+@pytest.mark.slow
+def test_urdf(files, faces):
+    robot = ElementTree.parse(files["urdf"]).getroot()
+    joints = robot.findall("joint")
+    require_frames([static_of_joint(joint) for joint in joints], faces)
+    links = {link.attrib["name"] for link in robot.findall("link")}
+    assert {part.attrib["link"] for joint in joints for part in joint if part.tag in ("parent", "child")} == links
+    radii = sorted(float(e.attrib["radius"]) for e in robot.iter("cylinder"))
+    np.testing.assert_allclose(radii, sorted(1e-3 * r for r in faces["radius_mm"].values()))
+
+
+@pytest.mark.slow
+def test_xacro(files, faces, tmp_path):
+    """Twice on one robot, by the program itself."""
+    xacro = importlib.import_module("xacro")
+    calls = "".join(
+        f'<xacro:box prefix="{side}_" parent="flange"><origin xyz="0 {y} 1" rpy="0 0 0"/></xacro:box>'
+        for side, y in (("left", 1), ("right", -1))
+    )
+    (tmp_path / "robot.xacro").write_text(
+        f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="{files["xacro"]}"/>'
+        f'<link name="flange"/>{calls}</robot>',
+        encoding="utf-8",
+    )
+    robot = ElementTree.fromstring(xacro.process_file(str(tmp_path / "robot.xacro")).toxml())
+    for side, y in (("left_", 1000.0), ("right_", -1000.0)):
+        own = [static_of_joint(j) for j in robot.findall("joint") if j.find("child").attrib["link"].startswith(side)]
+        mount, *statics = own
+        assert (mount.parent, mount.child, mount.pose.translation.tolist()) == ("flange", f"{side}box", [0, y, 1000])
+        for each in statics:
+            object.__setattr__(each, "parent", each.parent.removeprefix(side))
+            object.__setattr__(each, "child", each.child.removeprefix(side))
+        require_frames(statics, faces)
+
+
+@pytest.mark.parametrize(
+    ("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch), ("ros1", read_ros1_launch)]
+)
+def test_ros(files, faces, form, read):
+    require_frames(read(files[form].read_text(encoding="utf-8")), faces)
+
+
+def test_opencv_and_table(files, faces):
+    storage = cv2.FileStorage(str(files["opencv"]), cv2.FILE_STORAGE_READ)
+    found = storage.getNode("faces")
+    assert found.size() == len(faces["target_from_face"])
+    for place, (face, matrix) in enumerate(faces["target_from_face"].items()):
+        own = found.at(place)
+        assert own.getNode("id").string() == face
+        np.testing.assert_allclose(own.getNode("target_from_face").mat(), matrix, rtol=0, atol=AGAIN_MM)
+        assert own.getNode("target_from_face_covariance").mat().tolist() == faces["target_from_face_covariance"][face]
+        labels = [f"{face}:{own.getNode('circles').at(i).string()}" for i in range(own.getNode("circles").size())]
+        assert own.getNode("centres").mat().tolist() == [faces["circles"][label] for label in labels]
+        assert own.getNode("radii").mat().ravel().tolist() == [faces["radius_mm"][label] for label in labels]
+        covariances = own.getNode("centres_covariance").mat().reshape(-1, 3, 3)
+        assert covariances.tolist() == [faces["circle_covariance_mm2"][label] for label in labels]
+    with open(files["csv"], encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        place = [float(row[f"{c}_mm"]) for c in "xyz"]
+        matrix = np.array(faces["target_from_face"][row["face"]])
+        turn = Rotation.from_quat([float(row[f"q{c}"]) for c in "xyzw"]).as_matrix()
+        np.testing.assert_allclose(turn, matrix[:3, :3], atol=1e-12)
+        np.testing.assert_allclose([float(row[f"n{c}"]) for c in "xyz"], matrix[:3, 2], atol=1e-12)
+        sigma = [float(row[f"sigma_{c}_um"]) for c in "xyz"]
+        if row["kind"] == "face":
+            np.testing.assert_allclose(place, matrix[:3, 3], atol=AGAIN_MM)
+            variance = np.diag(faces["target_from_face_covariance"][row["face"]])
+            np.testing.assert_allclose(sigma, 1e3 * np.sqrt(np.maximum(variance[3:], 0)), rtol=1e-3)
+            turned = [float(row[f"sigma_r{c}_mdeg"]) for c in "xyz"]
+            np.testing.assert_allclose(turned, 1e3 * np.degrees(np.sqrt(np.maximum(variance[:3], 0))), rtol=1e-3)
+        else:
+            label = f"{row['face']}:{row['circle']}"
+            assert place == faces["circles"][label]
+            assert float(row["radius_mm"]) == faces["radius_mm"][label]
+            variance = np.diag(faces["circle_covariance_mm2"][label])
+            np.testing.assert_allclose(sigma, 1e3 * np.sqrt(variance), rtol=1e-3)
+    assert [row["kind"] for row in rows].count("circle") == len(faces["circles"])
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "root", "said"),
+    [
+        ("box.stl", "", "target", "E-OUTPUT-SUFFIX … .stl … --form"),
+        ("box", "", "target", "E-OUTPUT-SUFFIX … missing"),
+        ("box.csv", "stl", "target", "E-OPTION-FORM … --form … stl … urdf"),
+        ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
+        ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
+    ],
+)
+def test_refused(small_run, tmp_path, name, form, root, said):
+    refuses(said, export_run, small_run, tmp_path / name, form, root)

@@ -5,13 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stcal.boards.board_file import load_board
+from stcal import InputError, TargetDesign, load_board
 from stcal.boards.target_file import load_target, target_toml
 from stcal.cli.sfm.design_commands import design as command
-from stcal.design import TargetDesign
-from stcal.errors import InputError
 from stcal.lookalikes import MIN_COMMON
-from stcal.sfm import make
+from stcal.sfm import PlanOptions, make, plan
 from stcal.sfm.detect.face_patterns import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import (
     HIDDEN,
@@ -26,7 +24,6 @@ from stcal.sfm.make import (
     size_of,
     unnamed_cases,
 )
-from stcal.sfm.planning.session import PlanOptions, plan
 from stcal.synthetic.designs import second_design
 from tests.outcome import refuses
 
@@ -64,7 +61,7 @@ class Alike(TargetDesign):
 
 
 @pytest.mark.slow
-def test_likeness_is_found_where_there_is_some(made):
+def test_circles_are_seen_well_keep_apart_and_likeness_is_found_where_there_is_some(made):
     """A face beside itself, turned and mirrored; and the cases of hidden circles fail."""
     face = made.target.faces[0]
     turned = type(face)("turned", face.ids, face.xy_mm @ [[0, 1], [-1, 0]], face.radius_mm, face.origin, face.x, face.y)
@@ -77,6 +74,13 @@ def test_likeness_is_found_where_there_is_some(made):
     camera = DesignOptions(SIZE, width=2592).ideal_camera()
     failed, cases = unnamed_cases(two, camera, 800.0, HIDDEN, None)
     assert len(failed) == cases == 168
+    target, options = made.target, made.options
+    px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)
+    assert 2 * made.radius_mm * px_per_mm * np.sqrt(np.cos(np.radians(70))) > 1.4 * 4.5
+    for face in target.faces:
+        assert set(face.radius_mm) == {made.radius_mm, LARGE * made.radius_mm}
+        gap = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) - face.radius_mm[:, None] - face.radius_mm
+        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
 
 
 @pytest.mark.full
@@ -89,18 +93,7 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     assert make_target(options).cases == 5 * 84
 
 
-@pytest.mark.slow
-def test_circles_are_seen_well_and_keep_apart(made):
-    target, options = made.target, made.options
-    px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)
-    assert 2 * made.radius_mm * px_per_mm * np.sqrt(np.cos(np.radians(70))) > 1.4 * 4.5
-    for face in target.faces:
-        assert set(face.radius_mm) == {made.radius_mm, LARGE * made.radius_mm}
-        gap = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2) - face.radius_mm[:, None] - face.radius_mm
-        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0.5 * made.radius_mm
-
-
-def test_faces_lie_on_the_box():
+def test_faces_lie_on_the_box_some_sides_alone_have_circles_and_sizes_are_three_lengths():
     """Plates' corners are corners of the box, shared by three faces but for those below; normals point outwards."""
     corners = []
     for face in make_pattern(sides_of(SIZE), LEAST_CIRCLES, 4.0, "dark", 0, "box")[0].faces:
@@ -114,6 +107,15 @@ def test_faces_lie_on_the_box():
     box = {(x, y, z) for x in (-w / 2, w / 2) for y in (-d / 2, d / 2) for z in (-h / 2, h / 2)}
     assert set(counts) == box
     assert all(n == (3 if z > 0 else 2) for (_, _, z), n in counts.items())
+    assert faces_of("") == NAMES
+    names = faces_of("top, front")
+    assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
+    every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
+    for side in sides_of(SIZE, names):
+        np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
+    for size in ("130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"):
+        with pytest.raises(InputError, match="--size"):
+            DesignOptions(size_of(size))
 
 
 @pytest.mark.parametrize(
@@ -133,37 +135,16 @@ def test_what_cannot_be_made_is_refused(options, said):
     refuses(said, lambda: make_target(DesignOptions(SIZE, **options)))
 
 
-def test_some_sides_alone_have_circles():
-    assert faces_of("") == NAMES
-    names = faces_of("top, front")
-    assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
-    every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
-    for side in sides_of(SIZE, names):
-        np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
-
-
-@pytest.mark.parametrize("size", ["130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"])
-def test_sizes_are_three_lengths(size):
-    with pytest.raises(InputError, match="--size"):
-        DesignOptions(size_of(size))
-
-
-@pytest.mark.parametrize(
-    ("outline", "said"),
-    [
+def test_outlines_at_any_angle_are_taken_and_those_that_do_not_fit_refused(tmp_path):
+    for outline, said in (
         ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "E-TARGET-OUTLINE … outline_mm"),
         ("[[-50, -50], [-50, -50], [190, 190]]", "E-TARGET-OUTLINE"),
         ("[[-50, -50], [190, 190]]", "E-KEY-VALUE … outline_mm"),
         ("[[300, -50], [400, -40], [390, 190], [290, 180]]", "E-TARGET-OUTLINE … outline_mm"),  # beside all circles
-    ],
-)
-def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
-    text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
-    (tmp_path / "target.toml").write_text(text)
-    refuses(said, load_target, tmp_path / "target.toml")
-
-
-def test_outlines_at_any_angle_are_taken(tmp_path):
+    ):
+        text = target_toml(second_design()[0]).replace("circles = [", f"outline_mm = {outline}\ncircles = [", 1)
+        (tmp_path / "target.toml").write_text(text)
+        refuses(said, load_target, tmp_path / "target.toml")
     design = second_design()[0]
     middle, reach = design.faces[0].xy_mm.mean(0), np.ptp(design.faces[0].xy_mm, axis=0).max()
     angles = np.radians(50) + np.pi * np.array([0.1, 0.8, 1.2, 1.7])  # no two sides are parallel

@@ -178,8 +178,9 @@ def test_all_groups_in_one_world(saved, tmp_path):
         assert np.allclose(pose.matrix(), known, rtol=0, atol=1e-8), face  # as above: moved, and scaled to mm
 
 
-def test_circles_that_are_one_point_in_all_groups(saved):
-    """The run's final model: the circles of face 1 are seen by both groups, the board of each is its own."""
+def test_points_of_all_groups_and_boards_of_two_groups_merged(saved, tmp_path):
+    """In the run's final model the circles of face 1 are seen by both groups, the board of each is its own. The same
+    dot merged, but the board was moved between the groups: the point is neither's."""
     path = saved.folder / "colmap/target_model"
     groups = {group.group: group for group in read(path, saved).groups}
     place = {g: dict(zip(m.labels, m.xyz_model.tolist(), strict=True)) for g, m in groups.items()}
@@ -191,10 +192,6 @@ def test_circles_that_are_one_point_in_all_groups(saved):
         same = place["12"][label] == place["14"][label]
         assert same != label.startswith("board:"), label
     assert [m.group for m in calibrate_models(path, saved).models] == ["12", "14"]
-
-
-def test_boards_of_two_groups_merged(saved, tmp_path):
-    """The same dot, but the board was moved between the groups: the point is neither's."""
     target = pycolmap.Reconstruction(str(saved.folder / "colmap/target_model"))
     labels = {image.name: image.labels for image in saved.observations}
     dot = {}
@@ -211,7 +208,7 @@ def test_boards_of_two_groups_merged(saved, tmp_path):
     assert all("board:3:4" not in group.labels and "board:3:5" in group.labels for group in found.groups)
 
 
-def test_a_group_in_two_models(saved, model, plain, tmp_path):
+def test_a_group_in_two_models_and_models_with_different_cameras(saved, model, plain, tmp_path):
     """As the mapper writes them: 0, 1, …; the larger one counts."""
     gone = next(iter(model.images.values())).frame_id
     model.deregister_frame(gone)
@@ -223,9 +220,6 @@ def test_a_group_in_two_models(saved, model, plain, tmp_path):
     assert_same_faces(found, plain)
     assert len(found.models[0].images) == 4
     assert found.notes == ("group 12: in several models; the one with the most images was taken", NOT_THERE)
-
-
-def test_models_with_different_cameras(saved, model, tmp_path):
     own_copy(saved.folder / "colmap/models" / "14", tmp_path / "both" / "1")
     model.cameras[1].params = model.cameras[1].params * (1 + 1e-9)
     model.folder = tmp_path / "both" / "0"
@@ -390,13 +384,10 @@ def test_a_file_that_is_another_one_or_missing(saved, plain, tmp_path, name):
             calibrate_models(folder, saved)
 
 
-def test_an_empty_model(saved, stcal_sfm, tmp_path):
+def test_a_model_without_a_camera_and_one_without_the_group_of_the_reference_face(saved, stcal_sfm, tmp_path):
+    """Group 14 alone has no face 2; group 12 is missing and named."""
     pycolmap.Reconstruction().write_binary(str(tmp_path))
     assert_error(stcal_sfm("faces", tmp_path, "--run", saved.folder), INPUT, "E-MODEL-CAMERAS", "0")
-
-
-def test_a_lost_group_is_said_where_a_face_hangs_on_it(saved):
-    """Group 14 alone has no face 2; group 12 is missing and named."""
     options = replace(saved.options, reference_face="2")
     only = read(saved.folder / "colmap/models" / "14", saved)
     with fails_with("E-FACE-REFERENCE … 2"):

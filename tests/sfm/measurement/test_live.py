@@ -19,13 +19,11 @@ from typer.testing import CliRunner
 
 from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
-from stcal.sfm import MeasureOptions, measure
-from stcal.sfm.adjust.faces_file import read_target
+from stcal.sfm import MeasureOptions, Tracker, measure, read_target
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of, served
-from stcal.sfm.measurement.measure_images import Tracker
 from stcal.sfm.measurement.pose_report import poses_file
 from tests.outcome import fails_with
-from tests.sfm.truth import true_poses
+from tests.support.image_poses import true_poses
 
 
 @pytest.fixture
@@ -70,19 +68,19 @@ def huge() -> bytes:
     return bytes(data)
 
 
-@pytest.mark.parametrize(
-    ("data", "status", "code"),
-    [
+def test_what_is_no_image_of_this_camera_is_refused_and_a_browser_has_the_token_in_its_address(tracker):
+    for data, status, code in (
         (b"", 400, "E-IMAGE-UNREADABLE"),
         (png(np.zeros((480, 640), np.uint8))[:-9], 400, "E-IMAGE-TRUNCATED"),
         (png(np.zeros((48, 64), np.uint8)), 400, "E-IMAGE-SIZE"),
         (huge(), 400, "E-IMAGE-TOO-LARGE"),
         (bytes(1_100_000), 413, "E-SERVICE-REQUEST"),
-    ],
-)
-def test_what_is_no_image_of_this_camera(tracker, data, status, code):
-    answer = client(tracker, max_megabytes=1.0).post("/pose", content=data)
-    assert (answer.status_code, answer.json()["code"]) == (status, code)
+    ):
+        answer = client(tracker, max_megabytes=1.0).post("/pose", content=data)
+        assert (answer.status_code, answer.json()["code"]) == (status, code)
+    word = client(tracker, live=True, token="word")
+    assert [word.get(place).status_code for place in ("/?token=word", "/?token=wor", "/")] == [200, 401, 401]
+    assert [client(tracker).get("/").status_code, client(tracker).get("/pose").status_code] == [404, 405]
 
 
 OWN, EVIL = "127.0.0.1:8765", "evil.example:8765"
@@ -108,12 +106,6 @@ def test_who_is_answered(tracker, place, headers, token, status):
     method = "POST" if place == "/pose" else "GET"
     answer = TestClient(service.app).request(method, place, headers=headers)
     assert answer.status_code == (400 if status == 200 and method == "POST" else status)  # an image of no bytes
-
-
-def test_a_browser_has_the_token_in_its_address(tracker):
-    word = client(tracker, live=True, token="word")
-    assert [word.get(place).status_code for place in ("/?token=word", "/?token=wor", "/")] == [200, 401, 401]
-    assert [client(tracker).get("/").status_code, client(tracker).get("/pose").status_code] == [404, 405]
 
 
 @pytest.mark.slow
@@ -225,7 +217,8 @@ def test_the_command_answers_this_machine_until_interrupted(small_run, small_dat
     assert (code, content["images"][0]["image"]) == (200, photograph.name)
 
 
-def test_pages_get_the_newest_picture_and_the_last_one_before_the_end():
+def test_pages_get_the_newest_picture_and_addresses_at_which_none_listens_are_refused():
+    """And the last one before the end; other machines with a token."""
     service = LiveService(None, live=True)
     service.newest = {"picture": 1}
     with served(service, port=0) as url:
@@ -236,9 +229,6 @@ def test_pages_get_the_newest_picture_and_the_last_one_before_the_end():
         service.newest = {"picture": 2}
     assert stream.read() == b'\ndata: {"picture": 2}\n\nevent: ended\ndata: {}\n\n'
     line.close()
-
-
-def test_addresses_at_which_none_listens_and_other_machines_with_a_token():
     needs, unknown = "E-OPTION-NEEDS … --host 0.0.0.0 … --token", "E-SERVICE-ADDRESS … --host 999.1.1.1"
     for host, code in (("0.0.0.0", needs), ("999.1.1.1", unknown)):
         with fails_with(code), served(LiveService(None), host, 0):

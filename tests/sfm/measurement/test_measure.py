@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.design import reference_target
+from stcal import CameraPrior, Rigid, reference_target
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.camera import intrinsic_basis
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.camera_model import CameraPrior
 from stcal.io.table import read_table
 from stcal.sfm.adjust.faces_file import TargetCircles, read_target
 from stcal.sfm.data.patterns import project_circles
@@ -99,6 +97,8 @@ def test_no_flipped_pose_is_certain(scene, known, count, tilt_deg, distance_mm, 
 
 
 def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
+    """Images are resolved in order of their names. Certain, ambiguous, ambiguous: the second by the first, the third by
+    the second; not without asking."""
     rng = np.random.default_rng(4)
     truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
     alone, both = (see(scene, truth, faces, 0.5, np.random.default_rng(0)) for faces in (("1",), ("1", "2", "4")))
@@ -117,12 +117,7 @@ def test_a_second_face_or_the_previous_image_resolves_it(scene, known):
     assert resolved(pose, other.camera_from_target).camera_from_target is other.camera_from_target
     far = Rigid(Rigid.exp([0, 1.5, 0, 0, 0, 0]).rotation @ truth.rotation, truth.translation)
     assert resolved(pose, far).status == "ambiguous"
-
-
-def test_images_are_resolved_in_order_of_their_names(scene, known):
-    """Certain, ambiguous, ambiguous: the second by the first, the third by the second; not without asking."""
     rng = np.random.default_rng(4)
-    truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
     images = [
         replace(see(scene, truth, ("1", "2", "4") if i == 0 else ("1",), 0.5, rng), name=f"a/{i}", group="a")
         for i in range(3)
@@ -161,7 +156,8 @@ def test_derivatives_of_the_ellipse_centres(scene, known):
         assert np.abs(slope - exact.by_circle[..., k]).max() < 1e-9
 
 
-def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
+def test_a_pose_is_exact_names_its_outliers_and_has_the_sigma_factor_of_the_run_or_a_given_one(scene, known):
+    """Whatever the order of the circles."""
     truth, _, image = one_view(scene, np.random.default_rng(6), ("4",), 0.0, (30, 40), (800, 900))
     pose = pose_from_circles(image, known.truth, scene.camera)
     error = pose_error(pose.camera_from_target, truth)
@@ -171,6 +167,25 @@ def test_exact_centres_give_the_exact_pose_whatever_their_order(scene, known):
     turned = pose_from_circles(other_order, known.truth, scene.camera)
     assert np.abs(pose_error(turned.camera_from_target, pose.camera_from_target)).max() < 1e-9
     assert turned.labels == pose.labels
+    truth, _, image = one_view(scene, np.random.default_rng(8), ("2",), NOISE_PX, (20, 40), (900, 1000))
+    centre = image.centre_px.copy()
+    centre[3] += [0.8, -0.5]
+    pose = pose_from_circles(replace(image, name="a.jpg", centre_px=centre), known.truth, scene.camera)
+    assert [(o.image, o.label) for o in pose.outliers] == [("a.jpg", image.labels[3])]
+    assert image.labels[3] not in pose.labels
+    assert 0.7 < pose.outliers[0].residual_px < 1.5
+    error = pose_error(pose.camera_from_target, truth)
+    assert error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-3, 6)
+    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
+    own = known.truth
+    twice = TargetCircles(own.labels, own.xyz, own.radius, own.covariance, 2.0)
+    given = {"options": PoseOptions(sigma_factor=1.0)}
+    parts = [
+        pose_from_circles(image, target, scene.camera, **more).parts["image"]
+        for target, more in ((own, {}), (twice, {}), (twice, given))
+    ]
+    assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
+    assert np.allclose(parts[2], parts[0], rtol=1e-9, atol=0)
 
 
 def test_stated_intrinsics_go_into_the_covariance(scene, known):
@@ -192,32 +207,7 @@ def test_stated_intrinsics_go_into_the_covariance(scene, known):
     assert np.mean(held) > 3
 
 
-def test_outliers_are_named_and_left_out(scene, known):
-    truth, _, image = one_view(scene, np.random.default_rng(8), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    centre = image.centre_px.copy()
-    centre[3] += [0.8, -0.5]
-    pose = pose_from_circles(replace(image, name="a.jpg", centre_px=centre), known.truth, scene.camera)
-    assert [(o.image, o.label) for o in pose.outliers] == [("a.jpg", image.labels[3])]
-    assert image.labels[3] not in pose.labels
-    assert 0.7 < pose.outliers[0].residual_px < 1.5
-    error = pose_error(pose.camera_from_target, truth)
-    assert error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-3, 6)
-
-
-def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
-    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    own = known.truth
-    twice = TargetCircles(own.labels, own.xyz, own.radius, own.covariance, 2.0)
-    given = {"options": PoseOptions(sigma_factor=1.0)}
-    parts = [
-        pose_from_circles(image, target, scene.camera, **more).parts["image"]
-        for target, more in ((own, {}), (twice, {}), (twice, given))
-    ]
-    assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
-    assert np.allclose(parts[2], parts[0], rtol=1e-9, atol=0)
-
-
-def test_too_few_circles_and_wrong_labels(scene, known):
+def test_too_few_circles_wrong_labels_and_other_joints_are_refused(scene, known, tmp_path):
     _, _, image = one_view(scene, np.random.default_rng(11), ("2",), NOISE_PX, (20, 40), (900, 1000))
     for count in (0, 1, 3):
         few = image.select(list(range(count)))
@@ -236,9 +226,19 @@ def test_too_few_circles_and_wrong_labels(scene, known):
         pose_from_circles(mixed, known.truth, scene.camera)
     with fails_with("E-COVARIANCE-VALUE … 0"):
         pose_from_circles(replace(image, covariance_px2=0 * image.covariance_px2), known.truth, scene.camera)
+    for text, code in (
+        ("image,x_mm\na.jpg,1\n", "E-TABLE-COLUMNS-CONFLICT … x_mm"),
+        ("image,q1_deg\nb.jpg,1\n", "E-IMAGES-UNMATCHED … a.jpg"),
+        ("image,q1_deg\na.jpg,1\na.jpg,2\n", "E-TABLE-ROW-REPEATED … a.jpg"),
+    ):
+        _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
+        result = measured_from([replace(image, name="a.jpg")], scene.camera, known.truth)
+        (tmp_path / "joints.csv").write_text(text)
+        with fails_with(code):
+            poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
 
 
-def test_faces_json_holds_the_covariance_of_all_circles_together(small_run, tmp_path):
+def test_faces_json_holds_the_covariance_of_all_circles_and_one_of_another_target_is_refused(small_run, tmp_path):
     """Its blocks are the 3×3 that are there too; the reference face's origin has no error in its own plane. What an
     older file lacks is said."""
     content = json.loads((small_run / "faces.json").read_text())
@@ -260,6 +260,17 @@ def test_faces_json_holds_the_covariance_of_all_circles_together(small_run, tmp_
     assert any("covariances between circles" in note for note in target.notes)
     assert any("no centre_sigma_factor" in note for note in target.notes)
     assert np.abs(target.covariance[:3, 3:]).max() == 0 < np.trace(target.covariance)
+    for change, message in (
+        (other_circle, r"circle 7:1 is not in target"),
+        (lambda content: less(content["circles"]["2:7"], -5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
+        (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
+        (
+            lambda content: less(content["circles_joint_covariance_mm2"]["upper_triangle"], 1.0),
+            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_spoilt(small_run, tmp_path, change)
 
 
 def command(small_dataset, small_run, tmp_path, *more, faces=None):
@@ -323,40 +334,7 @@ def other_circle(content):
     labels[labels.index("1:1")] = "7:1"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (other_circle, r"circle 7:1 is not in target"),
-        (lambda content: less(content["circles"]["2:7"], -5.0), r"face 2 is 1\.\d+ mm RMS off that of target"),
-        (lambda content: content["radius_mm"].update({"2:7": 7.5}), r"circle 2:7 has radius 7\.5 mm, 8 mm in target"),
-        (
-            lambda content: less(content["circles_joint_covariance_mm2"]["upper_triangle"], 1.0),
-            r"circles_joint_covariance_mm2: variance -1\S* of x of 1:",
-        ),
-    ],
-)
-def test_faces_of_another_target_are_refused(small_run, tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
-        read_spoilt(small_run, tmp_path, change)
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("image,x_mm\na.jpg,1\n", "E-TABLE-COLUMNS-CONFLICT … x_mm"),
-        ("image,q1_deg\nb.jpg,1\n", "E-IMAGES-UNMATCHED … a.jpg"),
-        ("image,q1_deg\na.jpg,1\na.jpg,2\n", "E-TABLE-ROW-REPEATED … a.jpg"),
-    ],
-)
-def test_other_joints_are_refused(scene, known, tmp_path, text, code):
-    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
-    result = measured_from([replace(image, name="a.jpg")], scene.camera, known.truth)
-    (tmp_path / "joints.csv").write_text(text)
-    with fails_with(code):
-        poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
-
-
-def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
+def test_faces_that_are_not_calibrated_and_mistakes_in_the_camera_file_are_said(scene, known):
     rng, truth = np.random.default_rng(0), known.truth
     image = see(scene, view(face_view(scene, "2"), 0.3, 900, rng), ("2",), 0.02, rng)
     keep = [i for i, label in enumerate(truth.labels) if label.face != "2"]
@@ -366,27 +344,23 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     assert result.images == ()
     assert result.left_out[0].reason == "face 2 is not calibrated"
     assert measured_from([image.select([])], scene.camera, truth).left_out[0].reason == NO_FACE
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
+    for change, said in (
         (lambda camera: replace(camera, focal=camera.focal / 2, centre=(camera.centre + 0.5) / 2 - 0.5), "half"),
         (lambda camera: replace(camera, centre=camera.centre + 150), "cut out"),
         (lambda camera: replace(camera, focal=1.1 * camera.focal), None),
-    ],
-)
-def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
-    rng = np.random.default_rng(2)
-    images = [
-        replace(see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name)
-        for name in "abc"
-    ]
-    true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
-    shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
-    assert measured_from(shifted, true, known.truth).mistakes == ()
-    found = measured_from(shifted, change(true), known.truth).mistakes
-    assert found == () if said is None else said in found[0].replace("0.5 times", "half")
+    ):
+        rng = np.random.default_rng(2)
+        images = [
+            replace(
+                see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name
+            )
+            for name in "abc"
+        ]
+        true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
+        shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
+        assert measured_from(shifted, true, known.truth).mistakes == ()
+        found = measured_from(shifted, change(true), known.truth).mistakes
+        assert found == () if said is None else said in found[0].replace("0.5 times", "half")
 
 
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):

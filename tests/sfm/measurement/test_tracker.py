@@ -59,7 +59,7 @@ def off_sigmas(pose, other):
     return np.abs(pose_error(other.camera_from_target, pose.camera_from_target)) / np.sqrt(np.diag(pose.covariance))
 
 
-def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
+def test_a_followed_pose_is_that_of_a_search_and_what_jumps_is_searched_and_found(film, frames, target, model):
     follower, searcher = (Tracker(target, model[1], film.board) for _ in range(2))
     for i in range(IMAGES):
         searcher.forget()
@@ -69,9 +69,6 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         assert off_sigmas(own, other).max() < OTHER_BAND
         error = pose_error(own.camera_from_target, film.groups["12"].camera_from_target[i])
         assert error @ np.linalg.solve(own.covariance, error) < 28  # χ² of 6, one in 10 000
-
-
-def test_what_jumps_and_what_comes_after_an_image_without_the_target_is_searched_and_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     truth = film.groups["12"].camera_from_target
     for i, searched in ((0, True), (1, False), (None, True), (2, True), (25, True), (3, True)):
@@ -84,7 +81,7 @@ def test_what_jumps_and_what_comes_after_an_image_without_the_target_is_searched
         assert np.linalg.norm(pose.camera_from_target.translation - truth[i].translation) < 1
 
 
-def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
+def test_the_common_shift_is_found_and_a_hidden_face_missed_by_name(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     seen = tracker.locate(frames[0])
     hidden, face = frames[1].copy(), seen.faces[0]
@@ -96,9 +93,6 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     assert face not in left_over.faces
     assert not tracker.searched  # the other face has half of the circles, as many as are asked for
     assert any(note.startswith(f"face {face}: {face}:1 and 9 more should be in view") for note in tracker.notes)
-
-
-def test_the_common_shift_is_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     pose = tracker.locate(frames[0])
     predicted = tracker._predicted(pose.camera_from_target, tracker.camera, (), np.radians(70))
@@ -109,15 +103,10 @@ def test_the_common_shift_is_found(film, frames, target, model):
     assert not common_shift(np.zeros_like(frames[0]), predicted).any()
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)]
-)
-def test_what_is_no_image_of_the_camera_is_refused(target, model, image):
-    with pytest.raises(InputError, match=r"^image: "):
-        Tracker(target, model[1]).locate(image)
-
-
-def test_a_target_without_design_is_refused(target, model):
+def test_what_is_no_image_of_the_camera_and_a_target_without_design_are_refused(target, model):
+    for image in (np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)):
+        with pytest.raises(InputError, match=r"^image: "):
+            Tracker(target, model[1]).locate(image)
     bare = TargetCircles(target.labels, target.xyz, target.radius, target.covariance)
     with fails_with("E-FACES-DESIGN"):
         Tracker(bare, model[1])

@@ -10,9 +10,7 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-from stcal.design import reference_board, reference_target
-from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal import Camera, Rigid, reference_board, reference_target
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, model_of
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import equations
@@ -110,25 +108,23 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
     assert low < square < high, square / errors.size
 
 
-def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact):
+def test_images_are_worth_their_root_unless_the_board_dominates_and_scale_is_as_good_as_the_plate(exact):
+    """A plate of n dots with σ: its scale has σ/√Σr², whatever the images (least squares of a similarity)."""
     models = models_of(exact)
     doubled = [m.plus(replace(m, images=tuple(f"{name} again" for name in m.images))) for m in models]
     setups = [setup_of(exact, board_sigma_mm) for board_sigma_mm in (1e-4, 1.0)]
     once, twice = ([forecast(m, own) for own in setups] for m in (models, doubled))
     assert twice[0].worst()[1] / once[0].worst()[1] == pytest.approx(0.708, abs=1e-3)
     assert 0.85 <= twice[1].scale_sigma / once[1].scale_sigma <= 1
-
-
-def test_scale_is_as_good_as_the_plate(exact):
-    """A plate of n dots with σ: its scale has σ/√Σr², whatever the images (least squares of a similarity)."""
     setup = setup_of(exact, 0.02, 0.99)
     away = exact.board.xy_mm() - exact.board.xy_mm().mean(0)
     expected = 0.02 / np.sqrt((away**2).sum())
     assert forecast(models_of(exact, CentreNoise(1e-3)), setup).scale_sigma == pytest.approx(expected, rel=0.02)
 
 
-def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
-    """Fisher's information of a blurred disc, summed over pixels."""
+def test_centre_noise_is_a_cramer_rao_bound_found_again_and_what_a_rim_tells_the_integral_around_it(exact):
+    """Fisher's information of a blurred disc, summed over pixels. A rim against a polygon of 4096 sides, which errs by
+    (π/4096)²/6, a part in ten million."""
     radius, step = 15.0, 1e-3
     y, x = np.mgrid[-30:31, -30:31]
 
@@ -138,33 +134,26 @@ def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
     slope = (disc(step) - disc(-step)) / (2 * step)
     bound = IMAGE_NOISE / np.sqrt((slope**2).sum())
     assert PRACTICE * bound == pytest.approx(CentreNoise.expected().edge / np.sqrt(np.pi * radius), rel=0.01)
-
-
-@pytest.mark.parametrize("tilt_deg", [0.0, 76.0])
-def test_what_a_rim_tells_is_the_integral_around_it(tilt_deg):
-    """Against a polygon of 4096 sides, which errs by (π/4096)²/6, a part in ten million."""
-    camera = Camera(4000, 3000, [3000.0, 3000.0], [2000.0, 1500.0], np.zeros(8))
-    turn = Rigid.exp([np.radians(tilt_deg), 0, 0, 0, 0, 0]).rotation
-    angle = 2 * np.pi * np.arange(4096) / 4096
-    xyz = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4096)])
-    rim = 3000.0 * 1e-3 * (xyz @ turn.T)[:, :2]
-    side = np.roll(rim, -1, axis=0) - rim
-    across = np.column_stack([side[:, 1], -side[:, 0]]) / np.sqrt(np.linalg.norm(side, axis=1))[:, None]
-    labels = tuple(CircleLabel("1", str(i)) for i in range(4))
-    places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * 1e-3 @ turn.T
-    one = np.zeros(4, int)
-    model = MetricModel(
-        "1", ("a",), (Rigid(np.eye(3), [0.0, 0, 1000]),), labels, places, one, np.arange(4), np.arange(4),
-        np.zeros((4, 2)), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)),
-    )  # fmt: skip
-    found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
-    np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
-
-
-def test_centre_noise_is_found_again(exact):
     radius = exact.target.radius_of() | exact.board.radius_of()
     found = CentreNoise.measured(models_of(exact), exact.camera, radius)
     assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
+    for tilt_deg in (0.0, 76.0):
+        camera = Camera(4000, 3000, [3000.0, 3000.0], [2000.0, 1500.0], np.zeros(8))
+        turn = Rigid.exp([np.radians(tilt_deg), 0, 0, 0, 0, 0]).rotation
+        angle = 2 * np.pi * np.arange(4096) / 4096
+        xyz = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(4096)])
+        rim = 3000.0 * 1e-3 * (xyz @ turn.T)[:, :2]
+        side = np.roll(rim, -1, axis=0) - rim
+        across = np.column_stack([side[:, 1], -side[:, 0]]) / np.sqrt(np.linalg.norm(side, axis=1))[:, None]
+        labels = tuple(CircleLabel("1", str(i)) for i in range(4))
+        places = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * 1e-3 @ turn.T
+        one = np.zeros(4, int)
+        model = MetricModel(
+            "1", ("a",), (Rigid(np.eye(3), [0.0, 0, 1000]),), labels, places, one, np.arange(4), np.arange(4),
+            np.zeros((4, 2)), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)),
+        )  # fmt: skip
+        found = np.linalg.inv(CentreNoise(1.0).applied(model, camera, dict.fromkeys(labels, 1.0)).covariance_px2)
+        np.testing.assert_allclose(found[0], across.T @ across, rtol=1e-6, atol=1e-7)
 
 
 def known_from(scene: Scene) -> KnownRun:
@@ -248,15 +237,12 @@ def offered(known):
     return [(model, handed_over(candidates(*handed_over((known, model))))) for model in known.models]
 
 
-def test_an_advised_view_beats_a_random_one(known, advice, coarse):
+def test_an_advised_view_beats_a_random_one_unless_a_bad_board_dominates(known, advice, coarse):
     views = [view for _, own in offered(known) for view in own]
     random = [after(known, [view], advice.now).worst()[1] for view in views[::2]]
     now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
     assert best <= min(random) * (1 + 1e-6)
     assert (now - best) > 1.5 * (now - np.mean(random)) > 0
-
-
-def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
     found = advise(replace(known, setup=setup_of(known.scene, 0.2)), 1)
     assert found.board_dominates
     assert not advice.board_dominates
@@ -288,27 +274,19 @@ def test_a_candidate_shows_nothing_that_is_hidden(known, coarse):
             assert max(view.tilts_deg.values()) < 75
 
 
-def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
-    known = known_of(load_run(small_run))
+def test_advice_starts_from_a_runs_own_sigma_with_estimated_rims_and_says_where_it_is_not_to_be_trusted(small_run):
+    """No view lowers that of rims: each face lies half of an error of the height along its own normal."""
+    known = known_of(saved := load_run(small_run))
     now = forecast(known.models, known.setup)
     stated = json.loads((small_run / "faces.json").read_text())["target_from_face_covariance"]
     for face, covariance in now.face_covariance.items():
         # Huber's weights of the few long residuals make the difference.
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
-
-
-def test_a_plan_takes_a_camera_as_its_file():
-    camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
-    target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
-    for given in (camera, model_of(camera)):
-        options = PlanOptions(images=2, camera=given, groups=(("1", "2"),))
-        assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
-        near = PlanOptions(images=20, distance_mm=300.0, camera=given)
-        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
-
-
-def test_advice_holds_the_sigma_of_estimated_rims(small_run):
-    """No view lowers it: each face lies half of an error of the height along its own normal."""
+    first, *checks = saved.report["checks"]
+    failed = replace(saved, report=saved.report | {"checks": [first | {"verdict": "failed"}, *checks]})
+    control = replace(saved, options=replace(saved.options, eccentricity=False))
+    assert "uncorrected control" in doubts(control)
+    assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
     saved = load_run(small_run)
     faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
     summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
@@ -334,13 +312,17 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
         assert np.sqrt(further[face] ** 2 - further_seen[face] ** 2) == pytest.approx(expected, rel=0.02)
 
 
-def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(small_run):
-    saved = load_run(small_run)
-    first, *checks = saved.report["checks"]
-    failed = replace(saved, report=saved.report | {"checks": [first | {"verdict": "failed"}, *checks]})
-    control = replace(saved, options=replace(saved.options, eccentricity=False))
-    assert "uncorrected control" in doubts(control)
-    assert ("1 checks of" in doubts(failed), doubts(saved)) == (True, "")
+def test_a_plan_takes_a_camera_as_its_file_that_states_its_size():
+    camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
+    target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
+    for given in (camera, model_of(camera)):
+        options = PlanOptions(images=2, camera=given, groups=(("1", "2"),))
+        assert session._beside_board(options, target, board, None)[0].camera.same_as(camera)
+        near = PlanOptions(images=20, distance_mm=300.0, camera=given)
+        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
+    with fails_with("E-CAMERA-SIZE"):
+        PlanOptions(camera=camera)
 
 
 def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):
@@ -364,13 +346,26 @@ def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigm
     assert max(times) == pytest.approx(1, rel=2e-3)
 
 
-def test_plan_remedies_are_plans_of_their_own():
-    """Of faces 1, 2 and 3, the last two groups away from the first."""
+def test_plan_remedies_are_plans_of_their_own_and_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
+    """Of faces 1, 2 and 3, the last two groups away from the first. σ of all faces as by every dot, to 5 %: photographs
+    and board are the same, and the edges weigh more."""
     options = PlanOptions(width=2592, images=2, groups=(("1", "2"), ("2", "3")), noise=NOISE)
     designs = reference_target(), reference_board(), reference_target().rough_poses()
     two, four = (plan(replace(options, images=images), *designs) for images in (2, 4))
     assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
+    board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
+    board = replace(board, corner_radius_mm=None)
+    options, target = PlanOptions(images=2, groups=(("1", "2"), ("1", "4"))), reference_target()
+    found = []
+    for most in (session.MOST_DOTS, 1000):
+        monkeypatch.setattr(session, "MOST_DOTS", most)
+        _, models, setup = session._beside_board(options, target, board, target.rough_poses())
+        found.append((setup, forecast(models, setup).position_sigma_mm(), sum(setup.centres(m).sum() for m in models)))
+    (some, sigma, observations), (every, expected, all_observations) = found
+    np.testing.assert_allclose([sigma[face] for face in expected], list(expected.values()), rtol=0.05)
+    assert observations == pytest.approx(all_observations, rel=0.05)
+    assert some.stands_for > every.stands_for == 1
 
 
 @pytest.mark.parametrize(
@@ -405,12 +400,6 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
         nominal_poses(target, path if faces else None)
 
 
-def test_plan_needs_the_size_of_the_camera():
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
-    with fails_with("E-CAMERA-SIZE"):
-        PlanOptions(camera=camera)
-
-
 @pytest.mark.parametrize(("common", "refined"), [(0.0, True), (0.99, False)])
 def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, common, refined):
     """To rounding: the two ways differ in the order of elimination alone."""
@@ -428,19 +417,3 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     scaled = [each.camera_covariance / np.outer(unit, unit) for each in found]
     np.testing.assert_allclose(*scaled, rtol=0, atol=1e-6)
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
-
-
-def test_a_fine_board_is_forecast_by_some_of_its_dots(monkeypatch):
-    """σ of all faces as by every dot, to 5 %: photographs and board are the same, and the edges weigh more."""
-    board = replace(reference_board(), rows=16, columns=22, pitch_mm=16.0, radius_mm=5.0, corner=None)
-    board = replace(board, corner_radius_mm=None)
-    options, target = PlanOptions(images=2, groups=(("1", "2"), ("1", "4"))), reference_target()
-    found = []
-    for most in (session.MOST_DOTS, 1000):
-        monkeypatch.setattr(session, "MOST_DOTS", most)
-        _, models, setup = session._beside_board(options, target, board, target.rough_poses())
-        found.append((setup, forecast(models, setup).position_sigma_mm(), sum(setup.centres(m).sum() for m in models)))
-    (some, sigma, observations), (every, expected, all_observations) = found
-    np.testing.assert_allclose([sigma[face] for face in expected], list(expected.values()), rtol=0.05)
-    assert observations == pytest.approx(all_observations, rel=0.05)
-    assert some.stands_for > every.stands_for == 1

@@ -3,8 +3,6 @@
 import copy
 import re
 
-import pytest
-
 from stcal.errors import MappingError
 from stcal.sfm.data.group_model import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
@@ -42,7 +40,7 @@ def report(*checks: dict, source: str = "board", share: float = 0.36, **sigma_um
     return made
 
 
-def test_all_is_well():
+def test_all_is_well_or_what_makes_sigma_larger_is_named_in_the_words_of_a_photographer():
     found = judgement_of(report(f3=[3.04, 1.0, 1.0]))
     assert (found.verdict, found.use) == ("yes", "Yes: 17 checks passed.")
     assert (found.position_face, found.position_sigma_um) == ("3", 3.04)
@@ -51,44 +49,35 @@ def test_all_is_well():
     assert "2.0 ppm" in found.quality
     assert "64 % of the variance of face 3 along x (σ 3.0 µm)" in found.limit
     assert "2.2 of 3.0 µm" in found.next  # √(0.36 + 0.64/4) · 3.04
-
-
-@pytest.mark.parametrize("name", ["number", "distance", "angles", "blur", "light"])
-def test_what_makes_sigma_larger_is_named_in_the_words_of_a_photographer(name):
-    good = dict.fromkeys(["number", "distance", "angles", "blur", "light"], (7.3, 1.1))
-    found = judgement_of(report() | {"conditions": good})
-    assert found.limit.startswith("Number alone: distance, angles, blur, light are good. The centring of circles")
-    assert found.next.startswith("Nothing has to be done; four times the images")
-    found = judgement_of(report() | {"conditions": good | {name: (7.3, 2.04)}})
-    assert found.limit.startswith(f"{name.capitalize()}: ")
-    assert "; σ are up to 2.0 times larger. The centring of circles" in found.limit
-    assert found.next.startswith("Nothing has to be done. To be better, ")
-    found = judgement_of(report() | {"conditions": good | {name: (7.3, 8.0)}})
-    assert "Nothing has to be done" not in found.next
-    assert ". Or four times the images" in found.next
+    for name in ("number", "distance", "angles", "blur", "light"):
+        good = dict.fromkeys(["number", "distance", "angles", "blur", "light"], (7.3, 1.1))
+        found = judgement_of(report() | {"conditions": good})
+        assert found.limit.startswith("Number alone: distance, angles, blur, light are good. The centring of circles")
+        assert found.next.startswith("Nothing has to be done; four times the images")
+        found = judgement_of(report() | {"conditions": good | {name: (7.3, 2.04)}})
+        assert found.limit.startswith(f"{name.capitalize()}: ")
+        assert "; σ are up to 2.0 times larger. The centring of circles" in found.limit
+        assert found.next.startswith("Nothing has to be done. To be better, ")
+        found = judgement_of(report() | {"conditions": good | {name: (7.3, 8.0)}})
+        assert "Nothing has to be done" not in found.next
+        assert ". Or four times the images" in found.next
 
 
 WHOLE_SET = check(CAUSE, "failed", remedy="look") | {"title": OF_WHOLE_SET + "Check b"}
 
 
-@pytest.mark.parametrize(
-    ("others", "count"),
-    [
+def test_a_failed_check_forbids_the_use_and_a_suspicious_one_says_how_often_chance_makes_it():
+    for others, count in (
         ((check("a", "suspicious"), check("b", "failed", remedy="look"), check("c", "passed")), "1 of 3"),
-        # One that names an image comes first, one that does not tell what is wrong last, the cause of all before all.
+        # One that names an image comes first, one that does not tell what is wrong last, the cause of all before.
         ((check("a", "failed", ("face 2",)), check("b", "failed", ("a/1.jpg",), "look")), "2 of 2"),
         ((check("agreement", "failed", ("all",)), check("b", "failed", (), "look")), "2 of 2"),
         ((check("moved", "failed", ("a/1.jpg",), "wait"), check("c", "passed"), WHOLE_SET), "1 of 2"),
-    ],
-)
-def test_a_failed_check_forbids_the_use_and_the_remedy_of_the_first_is_next(others, count):
-    found = judgement_of(report(*others))
-    assert (found.verdict, found.next) == ("no", "Look.")
-    assert count in found.use
-    assert "Check b" in found.use
-
-
-def test_a_suspicious_check_says_how_often_chance_makes_one():
+    ):
+        found = judgement_of(report(*others))
+        assert (found.verdict, found.next) == ("no", "Look.")
+        assert count in found.use
+        assert "Check b" in found.use
     others = [check(f"c{i}", "passed") for i in range(16)]
     found = judgement_of(report(check("a", "suspicious", remedy="repeat it"), *others, check("d", "not possible")))
     assert found.verdict == "with care"
@@ -101,15 +90,12 @@ def test_a_suspicious_check_says_how_often_chance_makes_one():
     assert judgement_of(report(left_out, *others)).use == "With care: 1 of 17 checks is suspicious, the first: Check a."
 
 
-def test_the_face_that_stands_out_limits():
+def test_the_face_that_stands_out_limits_else_the_largest_share():
+    """Along z the board has more than the photographs of face 3; of x, y and z together it has less."""
     found = judgement_of(report(f4=[6.0, 3.0, 2.0]))
     assert found.limit == "Face 4: 6.0 µm along x, where the others have 2.0 µm; 2 images show it, of group a."
     assert "images that show face 4" in found.next
     assert judgement_of(report(f4=[3.9, 2.0, 2.0])).limit.startswith("The centring")  # less than twice 2.0 µm
-
-
-def test_the_largest_share_limits_of_the_face_and_axis_that_quality_names():
-    """Along z the board has more than the photographs of face 3; of x, y and z together it has less."""
     own = report(share=0.51, f3=[2.5, 2.5, 3.5])
     for kind, factor in (("board", 0.1), ("circles", 1.4), ("dots", 1.4)):
         sources = own["faces"]["3"]["translation_sources_um"]
@@ -121,43 +107,34 @@ def test_the_largest_share_limits_of_the_face_and_axis_that_quality_names():
     assert judgement_of(report(share=0.49)).limit.startswith("The centring")
 
 
-@pytest.mark.parametrize(
-    ("source", "edge_share", "words", "not_said"),
-    [
+def test_each_source_has_its_own_remedy_and_some_results_are_not_without_care():
+    """A σ of the edges of tags becomes no smaller by what is stated of the print."""
+    for source, edge_share, words, not_said in (
         ("sizes", 0.6, "[[scale]]", "size_sigma_mm"),
         ("sizes", 0.1, "size_sigma_mm", "edges"),
         ("distances", None, "a longer one", "size_sigma_mm"),
         ("intrinsics", None, "calibrate-camera", "[[scale]]"),
-    ],
-)
-def test_each_source_has_its_own_remedy(source, edge_share, words, not_said):
-    """A σ of the edges of tags becomes no smaller by what is stated of the print."""
-    own = report(source=source, share=0.8)
-    own["summary"]["edge_share"] = edge_share
-    found = judgement_of(own)
-    assert "80 % of the variance of face 4 along x (σ 2.0 µm)" in found.limit
-    assert words in found.next
-    assert not_said not in found.next
-
-
-@pytest.mark.parametrize(
-    ("own", "verdict", "part", "words"),
-    [
+    ):
+        own = report(source=source, share=0.8)
+        own["summary"]["edge_share"] = edge_share
+        found = judgement_of(own)
+        assert "80 % of the variance of face 4 along x (σ 2.0 µm)" in found.limit
+        assert words in found.next
+        assert not_said not in found.next
+    for own, verdict, part, words in (
         (report() | {"options": {"solve": "paper", "eccentricity": False}}, "no", "next", "--solve paper"),
         (report() | {"options": {"solve": "chain", "eccentricity": False}}, "no", "next", "--no-eccentricity"),
         (make(sigma=False), "with care", "next", "--solve joint"),
         (report() | {"crosscheck": {"differences": ["face 2 is off"]}}, "with care", "limit", "COLMAP differs: face 2"),
         # The dots of the board tell it where groups are lost.
         (report(check(CAUSE, "failed"), check("camera", "passed")), "no", "use", "Check cause"),
-    ],
-)
-def test_results_that_are_for_comparison_or_not_without_care(own, verdict, part, words):
-    found = judgement_of(own)
-    assert found.verdict == verdict
-    assert words in getattr(found, part)
+    ):
+        found = judgement_of(own)
+        assert found.verdict == verdict
+        assert words in getattr(found, part)
 
 
-def test_the_board_alone_and_one_face():
+def test_the_board_alone_one_face_and_what_is_missing():
     own = report()
     own["faces"] = {}
     found = judgement_of(own)
@@ -165,21 +142,6 @@ def test_the_board_alone_and_one_face():
     assert "3.6 µm RMS" in found.quality
     own["faces"] = {"1": report()["faces"]["1"]}
     assert "only one face" in judgement_of(own).limit
-
-
-def test_sigma_that_are_larger_than_pixels_explain_are_said():
-    own = report(check("groups", "suspicious") | {"enlarges": 1.8})
-    own["summary"] |= {"photographs_differ": 1.4, "sigma_enlarged": 1.8}
-    told = judgement_of(own)
-    assert (told.verdict, told.position_sigma_um) == ("with care", 2.0)
-    assert "differ 1.4 times" in told.use
-    assert "1.8 times as large, to cover what is beyond chance: Check groups" in told.use
-    own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
-    own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
-    assert judgement_of(own).use == "With care: focus changed, though no check failed."
-
-
-def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
@@ -190,15 +152,28 @@ def test_what_is_missing_is_said_too():
     assert told.next.endswith("For 2 more checks: add a group.")
 
 
-def test_checks_that_nobody_can_make_possible_are_not_missed():
-    """A body of tags has no circles and no board: what tests these is not applicable."""
+def test_sigma_that_are_larger_than_pixels_explain_and_premises_are_said():
+    own = report(check("groups", "suspicious") | {"enlarges": 1.8})
+    own["summary"] |= {"photographs_differ": 1.4, "sigma_enlarged": 1.8}
+    told = judgement_of(own)
+    assert (told.verdict, told.position_sigma_um) == ("with care", 2.0)
+    assert "differ 1.4 times" in told.use
+    assert "1.8 times as large, to cover what is beyond chance: Check groups" in told.use
+    own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
+    own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
+    assert judgement_of(own).use == "With care: focus changed, though no check failed."
+    own = report()
+    assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
+    own["options"]["refine_camera"] = True
+    assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")
+
+
+def test_what_nobody_can_make_possible_is_not_missed_but_photographs_that_do_not_test_one_another():
+    """A body of tags has no circles and no board: what tests these is not applicable. Two of five checks passed, but
+    none that residuals decide."""
     own = report(check("labels", "passed"), check("rim", "not possible"), check("halves", "not possible", remedy="add"))
     assert judgement_of(own).use == "Yes: 1 checks passed, 1 was not possible."
     assert count_verdicts(map(Check.read, own["checks"])) == "1 passed, 1 not possible, 1 not applicable"
-
-
-def test_photographs_that_do_not_test_one_another_are_no_yes():
-    """Two of five checks passed, but none that residuals decide."""
     keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
     missed = [check(key, verdict, remedy="add images") for key, verdict in keys.items()]
     own = report(check("pitch", "passed"), check("radius", "passed"), *missed)
@@ -209,7 +184,7 @@ def test_photographs_that_do_not_test_one_another_are_no_yes():
     assert judgement_of(report(*(check(k, v) for k, v in keys.items()))).verdict == "yes"
 
 
-def test_a_missing_face_that_was_expected_is_named():
+def test_a_face_that_was_expected_or_read_and_left_out_is_missing():
     own = report()
     own["summary"] |= {"faces_not_seen": ["5", "6"], "faces_expected": ["1", "6"]}
     told = judgement_of(own)
@@ -218,9 +193,6 @@ def test_a_missing_face_that_was_expected_is_named():
     assert "Face 6 should have been photographed" in told.limit
     own["checks"] = [check("a", "failed", remedy="x")]
     assert re.search("the first: Check a; .* faces 5, 6 ", judgement_of(own).use)
-
-
-def test_a_face_that_was_read_and_left_out_is_missing():
     own = report()
     own["summary"]["faces_not_seen"] = ["5"]
     own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "code": ELSEWHERE, "place": "5"} for i in range(3)]
@@ -232,7 +204,7 @@ def test_a_face_that_was_read_and_left_out_is_missing():
     assert (told.verdict, told.missing, "face 5 was read in 3 images" in told.use) == ("part", [], True)
 
 
-def test_a_group_that_was_left_out_calls_for_care_and_says_why():
+def test_a_group_that_was_left_out_calls_for_care_and_after_no_there_are_no_micrometres():
     """In place of what limits the rest, which is not what the user should look at first."""
     own = report()
     note = Note.of_group("25", MappingError("E-GROUP-NO-BOARD", "group 25: no board in 4 images; keep it in view"))
@@ -243,9 +215,6 @@ def test_a_group_that_was_left_out_calls_for_care_and_says_why():
     assert (told.limit, told.next) == ("Left out: group 25: no board in 4 images.", "Keep it in view.")
     own["checks"][0] = check("a", "suspicious")
     assert judgement_of(own).use.count("With care: ") == 1
-
-
-def test_after_no_there_are_no_micrometres_but_what_does_not_hold():
     for key in (key for key, (_, invalid) in CHECKS.items() if invalid):
         failed = report(check(key, "failed", remedy="x"), check("b", "passed"), f3=[3.04, 1.0, 1.0])
         told = judgement_of(failed).model_dump()
@@ -257,10 +226,3 @@ def test_after_no_there_are_no_micrometres_but_what_does_not_hold():
     page = report_html(failed, {})
     assert "No σ are shown" in page
     assert "3.04" not in page.replace("-3.04", "")
-
-
-def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
-    own = report()
-    assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
-    own["options"]["refine_camera"] = True
-    assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")

@@ -1,15 +1,28 @@
-"""The page, from a small report made by hand."""
+"""The page, from a small report made by hand, and figures of residuals: what they show is in the run. What ``compare``
+and ``measure`` take of a ``faces.json``: no other format, no other unit, no matrix that is none."""
 
 import base64
 import copy
+import json
 import re
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stcal import Rigid, reference_target
+from stcal.errors import InputError, InputNote
+from stcal.io.table import COVARIANCE as COLUMNS
+from stcal.io.table import POSE, pose_cells
+from stcal.sfm.adjust.faces_file import read_target
+from stcal.sfm.report.compare import compare, compare_poses, comparison_table, poses_table
+from stcal.sfm.report.run_figures import by_photograph, normalised_residuals, residual_field
 from stcal.sfm.report.run_page import report_html
+from stcal.sfm.runs import folder
+from stcal.synthetic.dataset import TruthFile
+from tests.outcome import fails_with
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -178,25 +191,24 @@ def rows_of(page: str, section: str) -> list[list[str]]:
     ]
 
 
-@pytest.mark.parametrize("kind", ["joint", "chained"])
-def test_the_page_is_whole_and_stands_alone(kind, request):
-    page = request.getfixturevalue(kind)
-    parsed = Page(page)
-    assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
-    assert len(parsed.ids) == len(set(parsed.ids))
-    inside = [r for r in parsed.references if r.startswith("#")]
-    embedded = [r for r in parsed.references if r.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,"))]
-    assert sorted(inside + embedded) == sorted(parsed.references)
-    assert {r[1:] for r in inside} <= set(parsed.ids)
-    assert {"link", "iframe", "object"}.isdisjoint(parsed.tags)
-    assert not re.search(r"url\(|@import|https?:", page)
-    assert re.findall(r"<script[^>]*>", page) == ['<script type="application/json">', "<script>"]  # scene, and ours
-    assert "alert(" not in "".join(re.findall(r"<script>(.*?)</script>", page, re.DOTALL))
-    assert NASTY in parsed.text
-    assert "target <one>" in parsed.text
-
-
-def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
+def test_the_page_is_whole_stands_alone_and_embeds_its_pictures(request, joint):
+    for kind in ("joint", "chained"):
+        page = request.getfixturevalue(kind)
+        parsed = Page(page)
+        assert parsed.tags.count("section") == parsed.tags.count("h2") == 9
+        assert len(parsed.ids) == len(set(parsed.ids))
+        inside = [r for r in parsed.references if r.startswith("#")]
+        embedded = [
+            r for r in parsed.references if r.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,"))
+        ]
+        assert sorted(inside + embedded) == sorted(parsed.references)
+        assert {r[1:] for r in inside} <= set(parsed.ids)
+        assert {"link", "iframe", "object"}.isdisjoint(parsed.tags)
+        assert not re.search(r"url\(|@import|https?:", page)
+        assert re.findall(r"<script[^>]*>", page) == ['<script type="application/json">', "<script>"]  # scene, and ours
+        assert "alert(" not in "".join(re.findall(r"<script>(.*?)</script>", page, re.DOTALL))
+        assert NASTY in parsed.text
+        assert "target <one>" in parsed.text
     plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
     assert len(plots) == 2  # board of the one group, and photographs
     for plot in plots:
@@ -208,7 +220,8 @@ def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     assert report_html(copy.deepcopy(make()), OVERLAYS) == joint
 
 
-def test_numbers_have_their_digits(joint):
+def test_numbers_have_their_digits_and_what_was_not_computed_is_a_dash(joint, chained):
+    """A control without eccentricity raises an alarm."""
     faces = rows_of(joint, "faces")
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6] in faces
     pose, sigma = ["150.0000", "0.0000", "-60.1235"], ["1.0", "2.1", "3.1", "0.50", "0.61", "0.72"]
@@ -220,16 +233,14 @@ def test_numbers_have_their_digits(joint):
     scale = ["a", "116.217538", "116.217598", "0 and 1", "-0.5", "6.4", "4", "3.0", "2.0", "3.6", "5.0"]
     assert scale in rows_of(joint, "scale")
     assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
-
-
-def test_what_was_not_computed_is_a_dash_and_a_control_without_eccentricity_raises_an_alarm(joint, chained):
     assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
     face_row = next(row for row in rows_of(chained, "faces") if row[0] == "2")
     assert face_row[4:] == ["–"] * 6
     assert "None" not in Page(chained).text
 
 
-def test_left_out_with_reasons():
+def test_left_out_with_reasons_and_sigma0_as_in_the_certificate(joint):
+    """0.93 makes no σ smaller, 1.3 makes all larger: the factor of ``budget`` is named beside it."""
     report = make()
     report["summary"]["faces_not_seen"] = ["6"]
     report["notes"] = [{"note": "group a: face <6> has no frame", "code": ""}]
@@ -246,12 +257,130 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-
-
-def test_sigma0_is_what_the_certificate_says(joint):
-    """0.93 makes no σ smaller, 1.3 makes all larger: the factor of ``budget`` is named beside it."""
     large = make()
     large["summary"]["sigma0"] = 1.3
     assert "leaves σ₀ = 0.93" in Page(joint).text
     assert "states the latter as 1.000" in Page(joint).text
     assert "states the latter as 1.300" in Page(report_html(large, OVERLAYS)).text
+
+
+def words(drawing) -> list[str]:
+    return re.findall(r">([^<]+)</text>", drawing.svg())
+
+
+def test_residuals_over_their_sigma_are_of_a_normal_distribution_and_figures_have_limits(small_result, monkeypatch):
+    """As in any adjustment with true σ. Circles that both groups show are counted as unknown in each, which makes the
+    share of the redundancy smaller by up to a sixth, and the spread larger by up to a twelfth."""
+    run, drawn = small_result.out, []
+    monkeypatch.setattr(folder, "report_html", lambda report, overlays, residuals, gone: drawn.append(residuals) or "")
+    folder._report_page(run, small_result.report)
+    values = np.concatenate([*drawn[0].values()])[:, 4:]
+    assert np.std(values) == pytest.approx(1.04, abs=0.06)
+    assert abs(np.corrcoef(values.T)[0, 1]) < 0.1
+    assert f"{values.size} coordinates, " in " ".join(words(normalised_residuals(values.ravel())))
+    one = np.tile([110.0, 70.0, 0.02, 0.0], (20, 1))
+    seen = words(residual_field(np.vstack([one, np.tile([1000.0, 70.0, 5.0, 0.0], (4, 1))]), (1200, 800)))
+    assert "20" in seen
+    assert "4" not in seen
+    assert any(text.startswith("0.02 px") for text in seen)
+    rows = [{"image": f"{i}.jpg", "rms_px": rms} for i, rms in enumerate((0.01, 0.05, 0.02))]
+    assert [text for text in words(by_photograph(rows)) if text.endswith(".jpg")] == ["1.jpg"]
+
+
+COVARIANCE = "target_from_face_covariance"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda content: content.update(unit="m"), r"unit: 'm': input should be 'mm'"),
+        (lambda content: content.update(format="stcal faces 2"), r"format: 'stcal faces 2': .*'stcal faces 1'"),
+        (lambda content: content[COVARIANCE]["2"].pop(), rf"{COVARIANCE}\.2: 5×6, 6×6 needed; give"),
+        (lambda content: content[COVARIANCE].update({"2": (-np.eye(6)).tolist()}), rf"{COVARIANCE}\.2: variance -1 of"),
+    ],
+)
+def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil, message):
+    content = json.loads((small_run / "faces.json").read_text())
+    spoil(content)
+    path = tmp_path / "faces.json"
+    path.write_text(json.dumps(content))
+    for read in (lambda: compare(path, small_dataset / "truth.json"), lambda: read_target(path, reference_target())):
+        with pytest.raises(InputError, match=message) as caught:
+            read()
+        assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_run_of_another_size_is_compared_and_a_place_beyond_all_reach_named(small_run, small_dataset, tmp_path):
+    """Its square overflows, which ended the fit in NumPy's error."""
+    for factor in (1.0, 1.05, 3.0):
+        content = json.loads((small_run / "faces.json").read_text())
+        content["circles"] = {label: [factor * v for v in xyz] for label, xyz in content["circles"].items()}
+        for matrix in content["target_from_face"].values():
+            for row in matrix[:3]:
+                row[3] *= factor
+        other = tmp_path / "faces.json"
+        other.write_text(json.dumps(content))
+        worst = compare(other, small_dataset / "truth.json").worst.translation_um
+        assert (worst > 1000) == (factor != 1.0)
+    content = json.loads((small_dataset / "truth.json").read_text())
+    label = next(iter(content["circles"]))
+    content["circles"][label][0] = 1e300
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(content))
+    with fails_with(f"E-VALUE-TOO-FAR … truth.json: circles.{label}"):
+        compare(small_run, path)
+
+
+def test_labels_are_counted_rightly_and_it_is_said_where_they_cannot_be(small_run, small_dataset, tmp_path):
+    for name in ("faces.json", "labels.csv"):
+        (tmp_path / name).write_bytes((small_run / name).read_bytes())
+    labels, truth = tmp_path / "labels.csv", small_dataset / "truth.json"
+    known, (head, *rows) = compare(tmp_path, truth), labels.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    assert known.labels.wrong == 0
+    assert "images that have labels" not in comparison_table(known)
+
+    def found(*lines: str):
+        labels.write_text("\n".join([head, *lines]))
+        return compare(tmp_path, truth)
+
+    a_column_less = [row for row, cell in zip(rows, cells, strict=True) if not re.fullmatch("board:.*:8", cell[4])]
+    assert len(a_column_less) < len(rows)
+    assert found(*a_column_less).labels.wrong == 0
+    lost = cells[0][2]
+    assert found(*rows, f"1,99,{lost},12,board:7:0,5,5").labels.wrong == 1  # off the board
+    without = found(*(row for row, cell in zip(rows, cells, strict=True) if cell[2] != lost))
+    assert (without.labels.images, without.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
+    said = f"in the {without.labels.images} of {known.labels.images} images that have labels"
+    assert said in comparison_table(without)
+    labels.write_text("image,label\n12/IMG_1000.jpg,1:a\n")
+    with pytest.warns(InputNote, match="labels.csv: damaged: the labels are not compared"):
+        assert compare(tmp_path, truth).labels is None
+    labels.unlink()
+    with pytest.warns(InputNote, match="labels.csv: No such file or directory: the labels are not compared"):
+        compare(tmp_path, truth)
+
+
+def test_measured_poses_are_compared_with_the_truth(small_dataset, tmp_path):
+    """Errors over σ of poses that err by what their covariances say are about 1; images are found by their file."""
+    truth = TruthFile.model_validate_json((small_dataset / "truth.json").read_text())
+    true = {name: Rigid.from_matrix(pose) for name, pose in truth.poses().items()}
+    rng, sigma = np.random.default_rng(0), np.array([1e-4, 2e-4, 1e-4, 0.01, 0.02, 0.05])
+
+    def table(names=None) -> Path:
+        rows = [["image", *POSE, *COLUMNS]]
+        for name, pose in true.items():
+            moved = Rigid.exp(np.append(rng.normal(0, sigma[:3]), [0, 0, 0])).rotation @ pose.rotation
+            found = Rigid(moved, pose.translation + rng.normal(0, sigma[3:]))
+            rows.append([names(name) if names else name, *pose_cells(found, np.diag(sigma**2))])
+        path = tmp_path / "poses.csv"
+        path.write_text("\n".join(map(",".join, rows)) + "\n", encoding="utf-8")
+        return path
+
+    found = compare_poses(table(), small_dataset / "truth.json")
+    assert found.images.keys() == true.keys()
+    over = np.array([each.normalised_error for each in found.images.values()])
+    assert 0.4 < (over**2).mean() < 1.6  # χ² of 8 images of 6 each, over 48: 1 ± 3 × 0.2
+    assert f"RMS of {len(true)} poses" in poses_table(found)
+    with fails_with("E-COMPARE-IMAGES … names like"):
+        compare_poses(table(names=lambda name: f"other-{Path(name).name}"), small_dataset / "truth.json")

@@ -1,4 +1,5 @@
-"""Bad input gets one line that names the thing and the remedy; odd but valid input is taken as it is."""
+"""Bad input gets one line that names the thing and the remedy; odd but valid input is taken as it is. Of designs and
+folders of groups that were forgotten or are wrong: what was assumed, and what the images say."""
 
 import csv
 import json
@@ -13,14 +14,19 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal import StcalError, reference_target
+from stcal.boards.target_file import target_toml
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
 from stcal.sfm.data.group_model import GROUP_LEFT_OUT
 from stcal.sfm.detect import detect_files as files
+from stcal.sfm.detect.face_patterns import likeness_notes
+from stcal.sfm.pipeline import run
+from stcal.synthetic import RenderOptions, SceneOptions, make_scene, second_design, write_dataset
 from stcal.synthetic.scene import image_circles
-from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, lines_of, refuses
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_page")]
 
 CHAIN = ("--solve", "chain")
 """For what is seen before faces are adjusted together, which takes half of a small run's time."""
@@ -67,22 +73,24 @@ def blacken(small, scene, group: str, board: bool, count: int) -> None:
         small.image(i, group).write_bytes(encoded(".jpg", picture))
 
 
-def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
-    small = small_set()
+def test_inputs_that_are_not_there(small_set, stcal_sfm):
+    """Designs that are impossible are in tests/boards/test_target_files.py."""
+    small = small_set("12")
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-VIDEO-UNREADABLE", str(small.camera), "a folder of images")
     assert not (small.out / ".stcal/cache" / "frames").exists()
-
-
-def test_no_image_is_left(small_set, stcal_sfm):
-    small = small_set("12")
-    for path in (small.images / "12").iterdir():
-        path.write_bytes(b"")
+    path = small.folder / "none.toml"
+    for kind in ("--target", "--board"):
+        outcome = stcal_sfm(*small.arguments(kind, path))
+        assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
+    for photograph in (small.images / "12").iterdir():
+        photograph.write_bytes(b"")
     parts = ("4", "12/IMG_1000.jpg", "empty file (0 bytes); copy it again")
     assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
+    shutil.rmtree(small.images / "12")
+    refuses("E-IMAGES-NONE", stcal_sfm, *small.arguments("--debug"))  # which lets the error through
 
 
-@pytest.mark.usefixtures("no_page")
 def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm):
     """Each photograph once, in whatever form and however often it lies in the folder; and one that shows no circle."""
     small = small_set("12")
@@ -130,7 +138,6 @@ def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm)
     assert (name, "0 of its circles or corners are in the model, 6 needed" in reason) == ("12/black.png", True)
 
 
-@pytest.mark.usefixtures("no_page")
 def test_a_group_without_the_board_and_a_photograph_in_two_groups(small_set, small_scene, stcal_sfm):
     """The run goes on without group 14, says why, and does not claim its face; the photograph is in neither group."""
     small = small_set("12", "14")
@@ -151,14 +158,6 @@ def test_a_group_without_the_board_and_a_photograph_in_two_groups(small_set, sma
     assert "4" not in faces
 
 
-@pytest.mark.parametrize("kind", ["target", "board"])
-def test_a_design_that_is_missing(small_set, stcal_sfm, kind):
-    """Impossible ones are in tests/boards/test_target_files.py."""
-    path = (small := small_set("12")).folder / "none.toml"
-    outcome = stcal_sfm(*small.arguments(f"--{kind}", path))
-    assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
-
-
 def opencv_yaml(focal: float, x: float, y: float, distortion: list[float]) -> str:
     """A camera file that does not state the image size."""
     matrix = [float(v) for v in (focal, 0, x, 0, focal, y, 0, 0, 1)]
@@ -170,16 +169,14 @@ WRONG_CAMERAS = [
     (None, INPUT, ("No such file", "camera file ")),
     ("prose", INPUT, ("E-CAMERA-UNREADABLE", "camera file ")),
     (opencv_yaml(5580, 2592, 1728, []), INPUT, ("E-CAMERA-CENTRE", "camera.yml", *OUTSIDE)),  # for larger images
-    pytest.param(
+    (
         opencv_yaml(3000, 648, 432, []),  # another one than took the images
         COMPUTATION,
         ("group 12: ", "check that the camera file belongs to the images"),
-        marks=pytest.mark.slow,
     ),
 ]
 
 
-@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize(("content", "code", "parts"), WRONG_CAMERAS)
 def test_a_camera_file_that_is_none_or_not_of_the_images(small_set, stcal_sfm, content, code, parts):
     """Others are in tests/io/test_camera.py."""
@@ -201,13 +198,6 @@ def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
     assert (small.out / "faces.json").read_text(encoding="utf-8") == "mine"
 
 
-def test_debug_lets_the_error_through(small_set, stcal_sfm):
-    small = small_set()
-    with fails_with("E-IMAGES-NONE"):
-        stcal_sfm(*small.arguments("--debug"))
-
-
-@pytest.mark.usefixtures("no_page")
 def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, monkeypatch):
     """Ctrl-C in the second photograph of two."""
     small = small_set("12", detected=False)
@@ -268,7 +258,6 @@ def test_a_format_of_more_bits_and_names_that_are_not_utf8(small_set, small_run,
     same_centres(detections(small.out), expected, 0.02)
 
 
-@pytest.mark.usefixtures("no_page")
 def test_a_camera_of_opencv_without_a_size_and_two_targets_in_view(small_set, small_run, small_scene, stcal_sfm):
     """A picture of the target lies in one image's corner: neither is read, and the real one is measured where the group
     predicts it."""
@@ -299,7 +288,6 @@ def test_a_camera_of_opencv_without_a_size_and_two_targets_in_view(small_set, sm
     assert labels["found"] >= 0.97 * labels["visible"]  # the copy may cover some
 
 
-@pytest.mark.usefixtures("no_page")
 def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     small = small_set("14")
     cache = small.out / ".stcal/cache"
@@ -327,3 +315,121 @@ def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     assert added == ["", "group", "overlay"]  # of that image
     new = detections(small.out)
     assert {key[0] for key in new if new[key] != own.get(key)} == {"14/IMG_1002.jpg"}
+
+
+TARGET_ASSUMED = "assumed: the reference target, 5 faces of 10 circles (no --target)"
+BOARD_ASSUMED = "assumed: the reference board, 7×9 dots of radius 7.5 mm, pitch 30 mm (no --board)"
+
+
+@pytest.fixture
+def two_images(small_set):
+    small = small_set("12", detected=False)
+    small.image(3).unlink()
+    small.image(2).unlink()
+    return small
+
+
+def test_the_reference_board_is_said_and_named_in_an_error(stcal_sfm, two_images, tmp_path):
+    target = tmp_path / "target.toml"
+    target.write_text(target_toml(second_design()[0]))
+    code, out, err = stcal_sfm(*two_images.arguments("--target", target))
+    assert code == 3
+    assert BOARD_ASSUMED in out
+    assert "no face of the target recognised" in err
+    assert BOARD_ASSUMED in err.splitlines()[-1]
+    assert "; a face in 0 of 2 images, the board in " in err
+    page = (two_images.out / "report.html").read_text("utf-8")  # and what there is to look at
+    assert "No: group 12: no face of the target recognised in 2 images" in page
+    assert re.findall(r'src="(overlays/12/[^"]+)"', page) == [f"overlays/12/{two_images.image(i).name}" for i in (0, 1)]
+
+
+def test_measure_calibrate_camera_and_plan_name_what_they_assumed(stcal_sfm, small_set, small_run, tmp_path):
+    small = small_set("12", detected=False)
+    for i in (1, 2, 3):
+        small.image(i).unlink()
+    one = "--workers", 1
+    code, out, err = stcal_sfm("calibrate-camera", small.images, "--out", tmp_path / "cameras.txt", *one)
+    assert code == 3
+    assert "the reference target" in out
+    assert "1 of 1 images show the board" in err
+    assert "pitch 30 mm (no --board)" in err
+    faces = tmp_path / "faces.json"
+    faces.write_bytes((small_run / "faces.json").read_bytes())  # without the target.toml beside it
+    measured = "measure", small.images, "--camera", small.camera, *one, "--out", tmp_path / "poses.csv", "--faces"
+    code, out, err = stcal_sfm(*measured, faces)
+    assert code == 0
+    assert TARGET_ASSUMED in out
+    code, out, err = stcal_sfm(*measured, small_run / "faces.json", "--overwrite")
+    assert code == 0
+    assert "no --target: " in out
+    assert not any(said in out for said in (TARGET_ASSUMED, "reference board"))
+    out = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")[1]
+    assert (TARGET_ASSUMED in out, BOARD_ASSUMED in out) == (True, True)
+    out = stcal_sfm("plan", "--run", small_run, "--images", 2, "--groups", "12")[1]
+    assert "assumed: " not in out
+    assert "1296×864 px" in out
+
+
+def test_a_run_with_another_pitch_names_the_measured_one(stcal_sfm, small_set):
+    small = small_set("12", detected=False)
+    board = small.folder / "board.toml"
+    board.write_text(board.read_text().replace("pitch_mm = 30.0", "pitch_mm = 25.0"))
+    code, _, err = stcal_sfm(*small.arguments("--board", board, "--target", small.folder / "target.toml"))
+    assert code == 4
+    assert "the board in board.toml is 0.833" in err
+    assert "times as large as the drawing in target.toml has the faces" in err
+
+
+def test_faces_that_one_circle_tells_apart_are_noted(stcal_sfm, tmp_path):
+    one, mirrored = likeness_notes(reference_target())
+    assert "faces 1, 2, 3, 4, 5: one circle tells each from another" in one
+    # Their circles c: (94.142, 65.858) and (100, 80), after a motion that fits the other nine.
+    assert "1:c against face 2, 15.3 mm" in one
+    assert "mirror images: 2 and 4, 3 and 5" in mirrored
+    assert likeness_notes(second_design()[0]) == []
+    path = tmp_path / "target.toml"
+    path.write_text(target_toml(reference_target()))
+    code, out, _ = stcal_sfm("plan", "--target", path, "--images", 2, "--width", 1296, "--groups", "12")
+    assert code == 0
+    assert out.startswith(f"note: {one}\nnote: {mirrored}\n")
+
+
+def test_images_without_folders_are_said_to_be_one_group_and_lost_boards_are_counted(stcal_sfm, small_set):
+    small = small_set("12", "14")
+    for group in ("12", "14"):
+        for i in range(4):
+            small.image(i, group).rename(small.images / f"{group}-{i}.jpg")
+        (small.images / group).rmdir()
+    files = "--target", small.folder / "target.toml", "--board", small.folder / "board.toml", "--solve", "chain"
+    code, out, _ = stcal_sfm(*small.arguments(*files))
+    assert code == 0
+    assert "assumed: 8 images that lie in no folder of a group are one group, in which only the camera moved" in out
+    # The board stood elsewhere in the other group: the images of one of both lose it.
+    assert "the board of 4 of them (1" in out
+    remedy = "put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+    assert remedy in " ".join(out.split())
+
+
+def test_the_parent_of_the_images_is_told_from_them(stcal_sfm, small_set):
+    small = small_set("12", detected=False)
+    outcome = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.out)
+    parts = ("images lie in <group>/ directly", f"did you mean {small.images}?")
+    assert_error(outcome, INPUT, "E-IMAGES-NONE", *parts)
+    small.image(0).rename(small.images / "stray.jpg")  # one image is found, and the others are deeper
+    code, _, err = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    assert code == 3
+    assert "group images: 1 usable image (images/stray.jpg), 2 needed" in err
+    assert "images/12: a folder inside a group; images lie in <group>/ directly; it holds images" in err
+    assert f"did you mean {small.images}?" in err
+
+
+def test_circles_cut_by_a_rim_are_named_where_a_run_fails_and_again_from_what_was_kept(stcal_sfm, tmp_path):
+    scene = make_scene(SceneOptions(seed=3, width=1728, height=1152, images_per_group=4, groups=(("2", "3"),)))
+    write_dataset(tmp_path, scene, RenderOptions(rim_mm=3.3), workers=1)
+    camera, target = tmp_path / "cameras.txt", tmp_path / "target.toml"
+    with pytest.raises(StcalError, match=r"; circles cut off on one side in 3 of 4 images: behind a rim\?"):
+        run(tmp_path / "images", camera, tmp_path / "out", target)
+    command = "detect", tmp_path / "images", "--camera", camera, "--target", target, "--out", tmp_path / "detect"
+    first, again = stcal_sfm(*command), stcal_sfm(*command)
+    assert "should be in view and not measured" in first[1]
+    assert again[1] == first[1]

@@ -77,7 +77,7 @@ def test_sparse_pairs_hold_every_track_together_as_all_pairs_do(crowd, seed, sha
     require_same_tracks(scene, spoiled)
 
 
-def test_sparse_pairs_are_few_of_all(crowd):
+def test_sparse_pairs_are_few_have_enough_labels_in_common_and_are_the_default_above_their_size(crowd):
     scene, observations = crowd
     require_same_tracks(scene, observations)
     every, sparse = (image_graph(observations, scene.board, kind) for kind in ("all", "sparse"))
@@ -85,26 +85,17 @@ def test_sparse_pairs_are_few_of_all(crowd):
     assert len(every.pairs) > 4000
     # Two skeletons with all their pairs, three or more links for every other image, a few between the groups.
     assert 2 * SKELETON * (SKELETON - 1) / 2 + 60 * NEIGHBOURS <= len(sparse.pairs) < 900
-
-
-def test_pairs_have_enough_labels_in_common_and_dots_of_their_group_only(crowd):
-    scene, observations = crowd
+    assert image_graph(observations[:SPARSE_FROM], scene.board).kind == "all"
+    assert image_graph(observations[: SPARSE_FROM + 1], scene.board).kind == "sparse"
     few = [observations[0], observations[1].select(np.arange(MIN_SHARED)), observations[2].select([0, 1])]
     labels = [set(o.labels) for o in few]
     wanted = [[i, j] for i in range(3) for j in range(i + 1, 3) if len(labels[i] & labels[j]) >= MIN_SHARED]
     assert image_graph(few, scene.board, "all").pairs.tolist() == wanted
-    scene, observations = crowd
     boards = [o.select([k for k, label in enumerate(o.labels) if label.startswith("board")]) for o in observations]
     for kind in ("all", "sparse"):
         pairs = image_graph(boards, scene.board, kind).pairs
         assert len(pairs)
         assert all(boards[i].group == boards[j].group for i, j in pairs)
-
-
-def test_sparse_is_the_default_above_its_size(crowd):
-    scene, observations = crowd
-    assert image_graph(observations[:SPARSE_FROM], scene.board).kind == "all"
-    assert image_graph(observations[: SPARSE_FROM + 1], scene.board).kind == "sparse"
 
 
 def test_the_skeleton_is_well_spread_and_sees_every_circle(crowd):
@@ -155,31 +146,24 @@ def first_images(model, count: int):
     return model.without(model.image_index >= count)
 
 
-def test_resection_places_the_other_images(placed):
+def test_resection_places_the_other_images_adds_missing_circles_and_leaves_out_others(
+    placed,
+):
     scene, group, true = placed
-    model = complete(first_images(true, 10), group, scene.camera, 4.0)
+    start = first_images(true, 10)
+    model = complete(start, group, scene.camera, 4.0)
     assert model.images == true.images
     rms = np.sqrt((model.residuals_px(scene.camera) ** 2).mean())
     # Ellipse centres against images of the centres: eccentricity is up to 0.2 px here, noise 0.02.
     assert NOISE_PX < rms < 0.15
     for ours, theirs in zip(model.camera_from_model, true.camera_from_model, strict=True):
         assert np.linalg.norm(ours.inverse().translation - theirs.inverse().translation) < 2  # mm at 1 m
-
-
-def test_resection_adds_the_circles_that_the_model_lacks(placed):
-    scene, group, true = placed
-    start = first_images(true, 10)
     lost = start.labels.index("1:3")
     without = start.without(start.point_index == lost)
     assert "1:3" not in without.labels
     model = complete(without, group, scene.camera, 4.0)
     error = model.xyz_model[model.labels.index("1:3")] - true.xyz_model[true.labels.index("1:3")]
     assert np.linalg.norm(error) < 0.2  # mm: eccentricity moves a circle by about 0.06
-
-
-def test_resection_leaves_out_what_does_not_fit(placed):
-    scene, group, true = placed
-    start = first_images(true, 10)
     few = group[21].select(np.arange(5))
     labels = tuple(np.random.default_rng(0).permutation(group[20].labels).tolist())
     wrong = replace(group[20], labels=labels)

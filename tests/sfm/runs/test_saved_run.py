@@ -1,7 +1,9 @@
-"""A run's folder read back: what was written, number by number, or one line that says which file is wrong."""
+"""A run's folder read back: what was written, number by number, or one line that says which file is wrong; and
+``report``: the page of a finished run made again, and its PDF."""
 
 import csv
 import json
+import math
 import re
 import shutil
 from dataclasses import asdict
@@ -13,14 +15,16 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_target
-from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
-from stcal.sfm import run
-from stcal.sfm.adjust.faces_file import read_target
+from stcal.io.files import BOARD, CAMERA, DATABASE, RUN_MARKER, TARGET
+from stcal.report.document import with_code
+from stcal.sfm import RunOptions, read_target, run
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.run_options import RunOptions
+from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs import folder
+from stcal.sfm.runs.folder import run_text
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.sfm.runs.transaction import MarkerFile, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder, verify
 from tests.outcome import INPUT, assert_error, refuses
 from tests.shared import own_copy, unsealed_copy
 
@@ -64,7 +68,7 @@ def grey(path) -> None:
     path.write_bytes(cv2.imencode(".jpg", np.full((864, 1296), 90, np.uint8))[1].tobytes())
 
 
-def test_labels_and_centres_are_the_same_numbers(written):
+def test_what_is_read_back_are_the_same_numbers_designs_and_options(written):
     result, saved = written
     assert [image.name for image in saved.observations] == [image.name for image in result.observations]
     for found, known in zip(saved.observations, result.observations, strict=True):
@@ -84,10 +88,6 @@ def test_labels_and_centres_are_the_same_numbers(written):
     assert [image.name for image in saved.groups()["12"]][1] == saved.observations[1].name == UNLABELLED
     assert [len(image.labels) > 70 for image in saved.observations] == [True, False, *[True] * 6]
     assert saved.observations[1].centre_px.shape == saved.corrected_px[1].shape == (0, 2)
-
-
-def test_camera_designs_options_and_faces_are_the_same(written):
-    result, saved = written
     assert saved.camera.same_as(result.camera)
     assert saved.camera.colmap_model == result.camera.colmap_model
     assert saved.target_design.radius_of() == result.target_design.radius_of()
@@ -121,9 +121,9 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     assert saved.photographs == tmp_path / "some images"
 
 
-@pytest.mark.parametrize(
-    ("groups", "given", "expected"),
-    [
+def test_which_faces_the_photographs_were_to_show():
+    target = reference_target()
+    for groups, given, expected in (
         (("12", "14"), (), ["1", "2", "4"]),
         (("1-2", "4_1"), (), ["1", "2", "4"]),
         (("1", "2"), (), []),  # numbers of groups, most likely
@@ -132,16 +132,11 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
         (("12", "1-far"), (), []),
         (("12",), ("5", "3"), ["3", "5"]),
         ((".",), ("1",), ["1"]),
-    ],
-)
-def test_which_faces_the_photographs_were_to_show(groups, given, expected):
-    assert RunOptions(expect_faces=given).faces_expected(groups, reference_target()) == expected
-    assert RunOptions(expect_faces=given, board_only=True).faces_expected(groups, reference_target()) == []
-
-
-def test_an_expected_face_that_the_design_lacks():
-    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, reference_target())
-    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, reference_target())
+    ):
+        assert RunOptions(expect_faces=given).faces_expected(groups, target) == expected
+        assert RunOptions(expect_faces=given, board_only=True).faces_expected(groups, target) == []
+    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, target)
+    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, target)
 
 
 def edited(change):
@@ -253,33 +248,25 @@ def test_a_folder_that_is_not_as_the_run_wrote_it_is_refused(own_run, case):
         refuses("E-RUN-CHANGED", read_target, own_run / name, own_run / TARGET)
 
 
-def test_not_a_run(own_run, tmp_path, stcal_sfm):
+def test_not_a_run_and_a_folder_of_detections_only(own_run, tmp_path, stcal_sfm, small_set):
     (own_run / ".stcal/run.json").unlink()
     for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
         outcome = stcal_sfm("faces", own_run / "colmap/models", "--run", path)
         assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", ".stcal/run.json", "--out")
-
-
-def test_a_folder_of_detections_only(small_set, stcal_sfm):
     small = small_set("12")
     stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
     outcome = stcal_sfm("faces", small.out, "--run", small.out)
     assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), f"{CAMERA}, {TARGET}")
 
 
-def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
-    """Rows name their image; what counts is their order in it."""
+def test_rows_in_another_order_are_the_same_and_the_runs_own_model_has_its_own_centres(small_run, tmp_path):
+    """Rows name their image; what counts is their order in it. Poses of the joint adjustment are others than those of
+    the groups, and with a wrong camera their eccentricities differ by more than a rounded number."""
     run = unsealed_copy(small_run, tmp_path / "run")
     rows(lambda body: sorted(body, key=lambda row: (-int(row[0]), int(row[1]))))(run / "labels.csv")
     found, known = load_run(run), load_run(small_run)
     assert [image.labels for image in found.observations] == [image.labels for image in known.observations]
     assert all(np.array_equal(a, b) for a, b in zip(found.corrected_px, known.corrected_px, strict=True))
-
-
-def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_path):
-    """Its poses are others than those of the groups, and with a wrong camera their eccentricities differ by more than a
-    rounded number: the run's own model is read with its own centres."""
-    run = unsealed_copy(small_run, tmp_path / "run")
 
     def shifted(body):
         return [[*row[:7], *(str(float(value) + 0.01) for value in row[7:9]), *row[9:]] for row in body]
@@ -287,3 +274,81 @@ def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_pa
     rows(shifted)(run / "labels.csv")
     found, known = (adjusted_run(load_run(folder))[0].result() for folder in (run, small_run))
     assert np.array_equal(found.xyz_model, known.xyz_model)
+
+
+@pytest.mark.slow
+def test_the_same_files_make_the_same_page_there_or_in_a_file_of_ones_own(
+    own_run, small_run, tmp_path, stcal_sfm, monkeypatch
+):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
+    (own_run / "report.html").write_text("spoilt")
+    assert verify(own_run).notes()
+    before, page = (own_run / RUN_MARKER).read_bytes(), (small_run / "report.html").read_bytes()
+    own = tmp_path / "for the lab"
+    code, out, _ = stcal_sfm("report", own_run, "--pdf", "--out", f"{own}.html")
+    assert (code, out) == (0, f"report: {own}.html\nreport: {own}.pdf\n")
+    assert (own.with_suffix(".html").read_bytes(), own.with_suffix(".pdf").read_bytes()) == (page, b"<!DOCTYPE html>")
+    assert ((own_run / RUN_MARKER).read_bytes(), (own_run / "report.pdf").exists()) == (before, False)
+    code, out, _ = stcal_sfm("report", own_run, "--pdf")
+    assert (code, out) == (0, f"report: {own_run}/report.html\nreport: {own_run}/report.pdf\n")
+    assert (own_run / "report.html").read_bytes() == page
+    assert (own_run / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
+    assert verify(own_run).notes() == []
+    with added_results(own_run) as stage:
+        (stage / "report.html").write_text("another")
+    assert not (own_run / "report.pdf").exists()  # it was made of the page before
+    assert verify(own_run).notes() == []
+
+
+def test_what_cannot_be_made_is_said_in_one_line(own_run, tmp_path, stcal_sfm):
+    assert_error(stcal_sfm("report", tmp_path), INPUT, "E-RUN-FOLDER", "--out")
+    assert_error(
+        stcal_sfm("report", own_run, "--out", tmp_path / "a.pdf"), INPUT, "E-OUTPUT-SUFFIX", "a.html", "--pdf", "a.pdf"
+    )
+    assert_error(stcal_sfm("report", own_run, "--out", own_run / "report.html"), INPUT, "E-OUTPUT-IS-INPUT", "run")
+    content = json.loads((own_run / "report.json").read_text())
+    del content["faces"]
+    (own_run / "report.json").write_text(json.dumps(content))
+    assert_error(stcal_sfm("report", own_run), INPUT, "E-RUN-DAMAGED", "report.json", "faces")
+    assert (own_run / "report.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("report.json", '"label": "1:1"', '"label": "?"'),
+        ("labels.csv", "\n1,0,", "\n1,0,12/IMG_1000.jpg,12,x,0,0,0,0,1,0,1,left,0\n1,0,"),
+    ],
+)
+def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own_run, stcal_sfm, name, old, new):
+    text, before = (own_run / name).read_text(), (own_run / "report.html").read_bytes()
+    (own_run / name).write_text(text.replace(old, new, 1))
+    assert_error(stcal_sfm("report", own_run), INPUT, "E-RUN-DAMAGED", f"{name}")
+    assert (own_run / "report.html").read_bytes() == before
+
+
+def test_terminal_file_and_page_have_the_same_judgement_and_residuals(small_result, small_run):
+    stored = Judgement.model_validate(json.loads((small_run / "report.json").read_text())["judgement"])
+    assert stored == small_result.judgement
+    page, terminal = (small_run / "report.html").read_text(), " ".join(run_text(small_result).split())
+    assert len(stored.answers()) == 4
+    for question, answer in stored.answers():
+        assert f"{question} {answer}" in terminal
+        assert f"<dt>{question}</dt><dd>{with_code(answer)}</dd>" in page
+    report = json.loads((small_run / "report.json").read_text())
+    with open(small_run / "labels.csv", encoding="utf-8", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["residual_x_px"]]
+    page = (small_run / "report.html").read_text()
+    factor = float(re.search(r"measured less projected, ([\d,]+) times", page)[1].replace(",", ""))
+    drawn = page.split('alt="Overlay of ')
+    for image in report["residuals_by_image"]:
+        own = [[float(row[f"residual_{axis}_px"]) for axis in "xy"] for row in rows if row["image"] == image["image"]]
+        assert len(own) == image["observations"]
+        assert math.sqrt(sum(x * x + y * y for x, y in own) / (2 * len(own))) == pytest.approx(image["rms_px"])
+        assert max(math.hypot(*each) for each in own) == pytest.approx(image["max_px"])
+        (part,) = [each for each in drawn if each.startswith(image["image"])]
+        vectors = re.findall(r"M[\d.-]+ [\d.-]+l([\d.-]+) ([\d.-]+)", part)
+        assert [[float(v) / factor for v in each] for each in vectors] == [
+            [pytest.approx(v, abs=0.051 / factor) for v in each] for each in own
+        ]

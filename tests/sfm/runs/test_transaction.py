@@ -47,37 +47,32 @@ def content(out):
 NEW = {"faces.json": "new", "report.json": "new", "colmap": "new", "overlays/12/a.jpg": "new"}
 
 
-def test_new_results_take_the_earlier_ones_place(tmp_path):
-    make(tmp_path / "run", "old", names=("faces.json", "labels.csv", "compare.json"))
-    (tmp_path / "run" / "notes.txt").write_text("mine")
-    make(tmp_path / "run", "new")
-    assert content(tmp_path / "run") == NEW | {"notes.txt": "mine"}
-    assert json.loads((tmp_path / "run" / RUN_MARKER).read_text())["program"] == "stcal-sfm"
+def test_new_results_take_the_earlier_ones_place_and_a_run_that_fails_leaves_them(tmp_path):
+    out = tmp_path / "run"
+    for names in (("faces.json", "report.json"), ("detections.csv",), ("faces.json", "labels.csv", "compare.json")):
+        make(out, "old", names=names)
+        before = content(out)
+        with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay"):
+            fail(out)
+        assert content(out) == before
+        assert verify(out).notes() == []
+    (out / "notes.txt").write_text("mine")
+    make(out, "new")
+    assert content(out) == NEW | {"notes.txt": "mine"}
+    assert json.loads((out / RUN_MARKER).read_text())["program"] == "stcal-sfm"
 
 
-@pytest.mark.parametrize("names", [("faces.json", "report.json"), ("detections.csv",)])
-def test_a_run_that_fails_leaves_the_earlier_results(tmp_path, names):
-    make(tmp_path / "run", "old", names=names)
-    before = content(tmp_path / "run")
-    with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay"):
-        fail(tmp_path / "run")
-    assert content(tmp_path / "run") == before
-    assert verify(tmp_path / "run").notes() == []
-
-
-@pytest.mark.parametrize("names", [("detections.csv",), ("detections.csv", "faces.json", "colmap")])
-def test_a_first_run_that_fails_leaves_what_helps_to_see_why(tmp_path, names):
+def test_a_first_run_that_fails_leaves_what_helps_to_see_why_and_one_of_too_long_a_path_nothing(tmp_path):
     """And no half results, as on a disk that fills: a ``faces.json`` without its report would pass for a result."""
-    with pytest.raises(DetectionError, match=r"^nothing found$"):
-        fail(tmp_path / "run", names)
-    assert content(tmp_path / "run") == {"detections.csv": "new", "overlays/12/a.jpg": "new"}
-    assert not (tmp_path / "run" / STAGE).exists()
-
-
-def test_a_path_that_is_too_long_for_a_database_is_refused_at_once(tmp_path):
     with fails_with("E-OUTPUT-LENGTH … 500"):
         make(tmp_path / ("x" * 200) / ("y" * 200) / ("z" * 200), "new")
     assert not any(tmp_path.iterdir())
+    for names in (("detections.csv",), ("detections.csv", "faces.json", "colmap")):
+        out = tmp_path / f"run {len(names)}"
+        with pytest.raises(DetectionError, match=r"^nothing found$"):
+            fail(out, names)
+        assert content(out) == {"detections.csv": "new", "overlays/12/a.jpg": "new"}
+        assert not (out / STAGE).exists()
 
 
 def ended_at(moment, monkeypatch, write_results):
@@ -98,32 +93,24 @@ def ended_at(moment, monkeypatch, write_results):
 
 
 @pytest.mark.parametrize("moment", range(len(NEW) + 3))
-def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
-    """Killed at each of the renames: what is opened next is whole, and the new one's."""
-    out = tmp_path / "run"
-    make(out, "old", names=("faces.json", "labels.csv", "compare.json"))
-    before = content(out)
-    ended_at(moment, monkeypatch, lambda: make(out, "new"))
-    complete_interrupted(out)
-    assert content(out) == (NEW if moment else before)
-    assert verify(out).notes() == []
-
-
-@pytest.mark.parametrize("moment", range(4))
-def test_an_addition_that_is_killed_is_completed_and_takes_nothing_away(tmp_path, moment, monkeypatch):
-    out = tmp_path / "run"
-    make(out, "old", names=("faces.json", "report.html", "report.pdf"))
-    before = content(out)
+def test_what_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
+    """A run and an addition, killed at each of the renames: what is opened next is whole, and the new one's. An
+    addition takes nothing away."""
+    run, own = tmp_path / "run", tmp_path / "own"
+    make(run, "old", names=("faces.json", "labels.csv", "compare.json"))
+    make(own, "old", names=("faces.json", "report.html", "report.pdf"))
 
     def add():
-        with added_results(out) as stage:
+        with added_results(own) as stage:
             (stage / "report.html").write_text("added")
 
-    ended_at(moment, monkeypatch, add)
-    complete_interrupted(out)
-    added = {name: text for name, text in before.items() if name != "report.pdf"} | {"report.html": "added"}
-    assert content(out) == (added if moment else before)
-    assert verify(out).notes() == []
+    added = {name: text for name, text in content(own).items() if name != "report.pdf"} | {"report.html": "added"}
+    for out, write_results, new in ((run, lambda: make(run, "new"), NEW), (own, add, added)):
+        before = content(out)
+        ended_at(moment, monkeypatch, write_results)
+        complete_interrupted(out)
+        assert content(out) == (new if moment else before)
+        assert verify(out).notes() == []
 
 
 HOLD = """
@@ -244,7 +231,9 @@ def test_what_a_command_adds_belongs_to_the_run_and_files_beside_it_do_not(made)
     assert verify(made).missing == ("compare.json",)
 
 
-def test_a_command_that_fails_adds_nothing(made):
+def test_a_command_that_fails_adds_nothing_and_runs_and_additions_wait_for_each_other(made):
+    """The same process counts as another one here: each claim opens the lock anew."""
+
     def add():
         with added_results(made) as stage:
             (stage / "report.json").write_text("half")
@@ -254,10 +243,6 @@ def test_a_command_that_fails_adds_nothing(made):
         add()
     assert verify(made).notes() == []
     assert not (made / ".stcal/unfinished").exists()
-
-
-def test_a_run_and_an_addition_wait_for_each_other(made):
-    """The same process counts as another one here: each claim opens the lock anew."""
     with added_results(made), fails_with("E-OUTPUT-IN-USE"):
         run_folder(made, MARKER, {}).__enter__()
     with run_folder(made, MARKER, {}), fails_with("E-OUTPUT-IN-USE"):
