@@ -85,7 +85,7 @@ ROW = DHRow(100.0, 0.0, 0.0, 0.0)
         (lambda: DHRow(float("nan"), 0, 0, 0), "E-ROBOT-ROW … a … nan"),
         (lambda: DHRow(0, "0", 0, 0), "E-ROBOT-ROW … alpha … '0'"),
         (lambda: Robot("a", "Modified", (ROW,), (Joint(),)), "E-OPTION-VALUE … robot a … 'Modified'"),
-        (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-ROBOT-ENTRIES … DHRow"),
+        (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-FIELD-TYPE … rows … DHRow"),
         (lambda: Robot("a", "modified", (DHRow(0.4, 0, 0.1, 0),), (Joint(),)), "E-LENGTH-UNIT … 0.4 mm … metres"),
         (lambda: TargetDesign("t", "black", (FACE,)), "E-OPTION-VALUE … 'black' … bright or dark"),
         (
@@ -148,7 +148,7 @@ INPUTS = [
     Joint(),
     Robot("a", "standard", (ROW,), (Joint(),)),
     robot.Measurements.from_arrays(np.zeros((3, 1)), np.zeros((3, 3))),
-    robot.Targets.from_poses(Poses.of([Rigid()])),
+    robot.Targets("t", (1,), ("",), Poses.of([Rigid()]), None),
     DesignOptions(),
     IdentifyOptions(),
     register.Pairs("pairs", range(3), np.eye(3), np.eye(3)),

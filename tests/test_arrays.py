@@ -69,7 +69,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
         (lambda: robot.Robot.from_dh(np.full((2, 4), 300), "standard", np.zeros((3, 2))), "E-ARRAY-SHAPE … (3, 2)"),
         (lambda: robot.Measurements.from_arrays(np.zeros((4, 6))), "E-MEASURED-KIND … positions"),
         (lambda: robot.Measurements.from_arrays(np.zeros((4, 6)), np.zeros((3, 3))), "E-ARRAY-SHAPE … positions"),
-        (lambda: robot.Targets.from_poses(Poses.of([Rigid()]), np.zeros((2, 6))), "E-NAMES-COUNT … 1"),
+        (lambda: robot.Targets("t", (1,), ("",), Poses.of([Rigid()]), np.zeros((2, 6))), "E-ARRAY-SHAPE … (2, 6)"),
         (lambda: handeye.HandEyePoses.from_matrices([], [], unit="km"), "E-OPTION-VALUE … 'km' … mm"),  # type: ignore
         (lambda: files_of_arrays({}), "E-IMAGES-NONE … memory"),
         (lambda: files_of_arrays({"a/b": [np.zeros((4, 4), np.uint8)]}), "E-IMAGES-GROUP … 'a/b'"),

@@ -43,14 +43,14 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
-    from stcal.robot.descriptions import coupled, read_universal, require_urdf_written
+    from stcal.robot.descriptions import coupled, require_urdf_written
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    known, to_xml = source.suffix.lower() in (*XML, ".toml"), out.suffix.lower() in XML
-    made = None if known else read_universal(source, nominal, convention)
-    begin = b"" if known else source.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")
-    from_xml = source.suffix.lower() in XML or begin.startswith(b"<")
+    suffix, to_xml = source.suffix.lower(), out.suffix.lower() in XML
+    begin = source.read_bytes()[:100] if source.is_file() else b""
+    from_xml = suffix in XML or begin.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    made = None if from_xml or suffix == ".toml" else arms.load_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
     if (from_link or to_link) and (made is not None or not from_xml):
@@ -294,22 +294,22 @@ def verify(
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
     from stcal.robot.robot_report import verification_figure, verification_report
-    from stcal.robot.use.evaluation import VerificationFile
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
         tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
-    result = arms.verify(arms.read_measured(tables))
-    document = verification_report(result)
+    data = arms.read_measured(tables)
+    result = arms.verify(data)
+    document = verification_report(result, data.where)
     say(document.text())
     print_each("note", result.notes)
-    print_each("warning", result.warnings())
+    print_each("warning", result.warnings)
     if plot:
         from stcal.report.svg import save
 
         save(verification_figure(result), plot)
         say(f"written: {plot}")
-    write_if(json_file, lambda: VerificationFile.model_validate(result))
+    write_if(json_file, lambda: result)
     write_if(report, document.page)
 
 

@@ -205,8 +205,6 @@ Finite = Annotated[
     float | None, BeforeValidator(lambda value: None if value is None or not np.isfinite(value) else value)
 ]
 """A number, or null in place of infinity and NaN, which JSON lacks."""
-Texts = Annotated[list[str], BeforeValidator(lambda texts: texts() if callable(texts) else texts)]
-"""Sentences, or the method of a result that returns them."""
 Pose = Annotated[np.ndarray, PoseShape((4, 4))]
 Matrix3 = Annotated[np.ndarray, Shape((3, 3))]
 Matrix4 = Annotated[np.ndarray, Shape((4, 4))]

@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -23,7 +23,7 @@ from stcal.io.table import pose_values
 from stcal.io.toml import Strict, load_yaml, validated
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
-from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
+from stcal.robot.kinematics.forward import carried_poses, fixed_values, forward
 from stcal.robot.kinematics.robot_file import load_robot
 from stcal.robot.kinematics.robot_model import Chain, Convention, DHRow, Joint, JointType, Robot, Tree
 
@@ -48,10 +48,10 @@ def few(names: Sequence[str], most: int = 12) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class UrdfRobot(Brief):
-    """A robot of a URDF, mm, rad; its joint values are those of the URDF's joints.
+    """A robot of a URDF, or of a calibration of Universal Robots, mm, rad; its joint values are those of the file.
 
     ``joints`` : names of the moving joints; ``from_link``, ``to_link`` : links between which the robot was read;
-    ``notes`` : missing limits of joints.
+    ``notes`` : missing limits of joints, and how angles were read.
     """
 
     robot: Robot
@@ -261,25 +261,23 @@ def _z_to(axis: np.ndarray) -> Rigid:
 
 def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, str]:
     """Returns links by names of tools, behind the last joint that moves."""
-    behind, pending, branches = [start], [start], []
-    while pending:
-        below = [joint for joint in joints.values() if joint.parent == pending[-1]]
-        pending.pop()
-        fixed = [joint.child for joint in below if not joint.moves]
-        branches += [joint for joint in below if joint.moves]
-        behind, pending = behind + fixed, pending + fixed
-        if not pending and len(branches) == 1:
-            last = branches.pop().child
-            behind, pending = [last], [last]
-    parents = {joint.parent for joint in joints.values()}
-    ends = [link for link in behind if link not in parents]
-    if len(ends) == 1 and not branches:
-        return {"": ends[0]}
-    if not branches and TOOL in ends:
-        return {"": TOOL} | {link.removeprefix(f"{TOOL}_"): link for link in ends if link.startswith(f"{TOOL}_")}
-    if not branches and TOOL0 in ends:
-        return {"": TOOL0}
-    every = [link for link in joints if link not in parents] if branches else ends
+    above: dict[str, int] = {}  # number of moving joints from the start to each link behind it
+    for link in [start, *joints]:
+        at, moving = link, 0
+        while at != start and at in joints:
+            at, moving = joints[at].parent, moving + joints[at].moves
+        if at == start:
+            above[link] = moving
+    parents, most = {joint.parent for joint in joints.values()}, max(above.values())
+    every = [link for link in above if link not in parents]
+    if sum(joints[link].moves for link in above if link != start) == most:  # one chain
+        every = [link for link in every if above[link] == most]
+        if len(every) == 1:
+            return {"": every[0]}
+        if TOOL in every:
+            return {"": TOOL} | {link.removeprefix(f"{TOOL}_"): link for link in every if link.startswith(f"{TOOL}_")}
+        if TOOL0 in every:
+            return {"": TOOL0}
     raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {few(every)}")
 
 
@@ -373,23 +371,18 @@ def coupled(robot: Robot) -> bool:
 
 def require_urdf_written(path: str | Path, robot: Robot) -> None:
     """Read a written URDF again, and require that it leads every tool where the robot does; raises ConvergenceError."""
-    q = fixed_values(len(robot.rows))
+    q, several = fixed_values(len(robot.rows)), len(robot.tools) > 1
 
     def tips(pose: Callable[[str], Poses]) -> np.ndarray:
         return np.array([pose_values(pose(name)) for name in robot.tools])
 
     def again() -> np.ndarray:
-        kinematic = q @ robot.coupling.T
-        if not robot.tree:
-            found = load_urdf(path, convention=robot.convention).robot
-            chain = found.chain()
-            return tips(lambda name: flange_poses(chain, kinematic) @ found.tool(name))
-        read = load_urdf(path, BASE, [link_of(name) for name in robot.tools], robot.convention)
+        read = load_urdf(path, WORLD, [link_of(name) for name in robot.tools], robot.convention)
         order = [int(name.removeprefix("joint_")) - 1 for name in read.joints]
-        return tips(lambda name: read.robot.world_from_base @ forward(read.robot, kinematic[:, order], link_of(name)))
+        kinematic, base = (q @ robot.coupling.T)[:, order], read.robot.world_from_base
+        return tips(lambda name: base @ forward(read.robot, kinematic, link_of(name) if several else ""))
 
-    base = Rigid() if robot.tree else robot.world_from_base  # a tree is read from its base
-    wanted = tips(lambda name: base @ forward(robot, q, name))
+    wanted = tips(lambda name: robot.world_from_base @ forward(robot, q, name))
     far = max(SAME_MM, 1e-12 * float(np.abs(wanted).max()))
     require_written(path, again, wanted, far, "mm")
 
@@ -417,24 +410,14 @@ class _UrFile(Strict):
     kinematics: dict[str, _Link]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UniversalRobot:
-    """An arm of Universal Robots: ``robot``, and ``notes`` on how its file was read."""
-
-    robot: Robot
-    notes: tuple[str, ...]
-
-
-def _of_kinematics(content: dict, where: str, convention: Convention) -> UniversalRobot:
+def _of_kinematics(content: dict, where: str, convention: Convention) -> UrdfRobot:
     """Returns the arm of ur_calibration's YAML. Its roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed
     ones. The base is the controller's; ROS's base_link is rotated by half a turn about Z."""
     held = content["kinematics"]
-    if isinstance(held, Mapping):  # the hash of the robot stands among the links
+    if isinstance(held, dict):  # the hash of the robot stands among the links
         if missing := [name for name in LINKS if name not in held]:
-            fault = f"{where}: kinematics without {', '.join(missing)}"
-            needed = f"an arm of Universal Robots has six links, {', '.join(LINKS)}"
-            remedy = "extract its calibration anew with ur_calibration, or copy the whole file"
-            raise InputError("E-KEY-MISSING", f"{fault}; {needed}: {remedy}")
+            fault = f"{where}: kinematics without {', '.join(missing)}; an arm of Universal Robots has six links"
+            raise InputError("E-KEY-MISSING", f"{fault}: extract its calibration anew with ur_calibration")
         content = {**content, "kinematics": {name: held[name] for name in LINKS}}
     joints, flange, as_urdf, z = [], Rigid(), Rigid(), np.array([0.0, 0.0, 1.0])
     links = validated(content, _UrFile, where).kinematics
@@ -448,10 +431,11 @@ def _of_kinematics(content: dict, where: str, convention: Convention) -> Univers
         "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
         f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
     )
-    return UniversalRobot(robot_of({"": joints}, NAME, convention), (said,) if off_mm >= LEAST_OFF_MM else ())
+    notes = (said,) if off_mm >= LEAST_OFF_MM else ()
+    return UrdfRobot(robot_of({"": joints}, NAME, convention), LINKS, BASE, LINKS[-1], notes)
 
 
-def _of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> UniversalRobot:
+def _of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> UrdfRobot:
     """Returns the arm of a calibration.conf: the one of its [DH] section or ``nominal``, and its deviations.
 
     Axes of upper arm, forearm and wrist are nearly parallel: the controller's rows have lengths of many metres that
@@ -474,13 +458,11 @@ def _of_conf(text: str, where: str, nominal: Robot | None, convention: Conventio
     if all(name in lists for name in ("a", "d", "alpha")):
         table = np.column_stack([METRE_MM * six("a"), six("alpha"), METRE_MM * six("d"), np.zeros(JOINTS)])
         arm = Robot(NAME, "standard", tuple(DHRow(*row) for row in table.tolist()), joints, unusual_size=True)
-    elif nominal is None:
-        remedy = "give --nominal robot.toml with the rows of the model"
-        fault = f"{where}: deviations from a nominal arm, which it does not state; {remedy}"
-        raise InputError("E-ROBOT-NOMINAL", f"{fault}, or add [DH] with a, d and alpha of urcontrol.conf")
-    elif len(nominal.rows) != JOINTS or nominal.convention != "standard" or nominal.prismatic.any():
-        fault = f"{where}: --nominal: {len(nominal.rows)} joints, convention {nominal.convention}"
-        raise InputError("E-ROBOT-NOMINAL", f"{fault}; six that turn, standard, needed")
+    elif nominal is None or len(joints) != JOINTS or nominal.convention != "standard" or nominal.prismatic.any():
+        given = "none is given" if nominal is None else f"that given has {len(joints)} joints, {nominal.convention}"
+        needed = "give --nominal robot.toml with its six joints that turn, standard, or add [DH] with a, d and alpha"
+        fault = f"{where}: deviations from a nominal arm, which it does not state, and {given}"
+        raise InputError("E-ROBOT-NOMINAL", f"{fault}; {needed} of urcontrol.conf")
     else:
         arm = nominal
     corrected = tuple(
@@ -492,13 +474,14 @@ def _of_conf(text: str, where: str, nominal: Robot | None, convention: Conventio
     q = fixed_values(JOINTS)
     for tool in arm.tools:
         require_near(found.world_from_base @ forward(found, q, tool), forward(controller, q, tool))
-    return UniversalRobot(replace(found, world_from_base=arm.world_from_base @ found.world_from_base), ())
+    placed = replace(found, world_from_base=arm.world_from_base @ found.world_from_base)
+    return UrdfRobot(placed, LINKS, BASE, LINKS[-1], ())
 
 
 @require_arguments
 def load_universal(
     path: str | Path, nominal: Robot | str | Path | None = None, convention: Convention = "standard"
-) -> UniversalRobot:
+) -> UrdfRobot:
     """Returns the calibrated arm of Universal Robots of a file of ur_calibration (YAML), or of calibration.conf.
 
     ``path`` : the file; ``nominal`` : the arm to whose rows the deviations of a calibration.conf are added, if that
@@ -506,30 +489,23 @@ def load_universal(
     controller's base. Raises InputError: another file, a value that is missing or no number, or ``nominal`` does not
     fit or is not needed.
     """
-    found = read_universal(Path(path), nominal, convention)
-    if found is None:
-        fault = f"robot {path}: no calibration of Universal Robots"
-        raise InputError("E-ROBOT-FORM", f"{fault}; ur_calibration's YAML needed, or its calibration.conf")
-    return found
-
-
-def read_universal(path: Path, nominal: Robot | str | Path | None, convention: Convention) -> UniversalRobot | None:
-    """Returns what :func:`load_universal` does, None for any other file."""
+    where = f"robot {path}"
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
     except OSError as error:
-        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError:
-        return None
+        text = ""
     if _DELTA.search(text):
         drawn = nominal if nominal is None or isinstance(nominal, Robot) else load_robot(nominal)
         return _of_conf(text, str(path), drawn, convention)
     try:
         content = load_yaml(text) if "kinematics" in text else None
     except (yaml.YAMLError, ValueError, RecursionError):
-        return None
+        content = None
     if not isinstance(content, dict) or "kinematics" not in content:
-        return None
+        fault = f"{where}: no calibration of Universal Robots, and its name ends neither in .toml nor in .urdf"
+        raise InputError("E-ROBOT-FORM", f"{fault}; ur_calibration's YAML needed, or its calibration.conf")
     if nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
     return _of_kinematics(content, str(path), convention)

@@ -21,7 +21,7 @@ from stcal.report.document import (
     plot,
     subheading,
 )
-from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
+from stcal.report.svg import COLOURS, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import MEANING, Observed, State, sigma_of
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, PlacedFrame, dh_values
@@ -81,7 +81,7 @@ def identified_report(result: Identified) -> Document:
         listed("kept nominal, as the data do not determine it", result.undetermined),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
-    drawn = result.state, seen, result.residuals, result.weights >= GROSS, result.left or ()
+    drawn = result.state, seen, result.residuals, result.weights >= GROSS
     weak = Table(["<Where", "error mm", "weight"], outliers)
     data = f"{len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from {seen.data.where}"
     return Document(
@@ -220,17 +220,8 @@ def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, n
 
 @require_arguments
 def offsets_csv(result: Identified, nominal: Robot) -> str:
-    """Returns the table of mastering offsets and differences of D-H values.
-
-    Parameters
-    ----------
-    result : the robot as identified, of :func:`~stcal.robot.identify`.
-    nominal : the robot from which it was identified.
-
-    Returns
-    -------
-    str : CSV in mm and degrees, with σ (form: ``data_layout.md``).
-    """
+    """Returns the CSV of mastering offsets, and of differences of D-H values, of ``result`` from the ``nominal`` robot
+    from which it was identified, in mm and degrees, with σ (form: ``data_layout.md``)."""
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)
     unit, of_zeros = np.where(nominal.prismatic, "mm", "deg"), (nominal.shown * change, nominal.shown * change_sigma)
@@ -249,51 +240,33 @@ FEW = 200  # number of rows beyond which points are drawn small
 
 
 def joints_figure(
-    state: State,
-    seen: Observed,
-    residuals: np.ndarray,
-    good: np.ndarray,
-    findings: Iterable[Effect],
-    colour: str = COLOURS[0],
+    state: State, seen: Observed, residuals: np.ndarray, good: np.ndarray, colour: str = COLOURS[0]
 ) -> Drawing:
     """Returns a figure of residuals (r, w) of good rows (r,), in the world's axes, along each joint's motion by its
-    value, with the findings' curves."""
-    data, chain = seen.data, state.chain
-    tip = state.tips_of(data)
+    value."""
+    data, chain, points = seen.data, state.chain, []
+    tip, errors = state.tips_of(data), residuals[:, -3:]
     twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]
-    values, errors = data.q @ chain.coupling.T, residuals[:, -3:]
-    across = min(len(chain), 3)
-    turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
-    points = []
-    for i, (twist, sliding) in enumerate(zip(twists, chain.prismatic, strict=True)):
+    values = (data.q @ chain.coupling.T).T * np.where(chain.prismatic, 1, np.degrees(1))[:, None]
+    for twist, value in zip(twists, values, strict=True):
         motion = state.as_seen(seen, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
         moves = good & (size > LEAST_MOTION * max(size.max(), 1e-300))
         along = np.einsum("rw,rw->r", motion[moves], errors[moves]) / size[moves]
-        at = values[seen.first[moves], i] * (1 if sliding else np.degrees(1))
-        points.append((at, along, "mm" if sliding else "deg"))
-    y = limits(np.concatenate([along for _, along, _ in points]))
+        points.append((value[seen.first[moves]], along))
+    y, across = limits(np.concatenate([along for _, along in points])), min(len(chain), 3)
     down = -(-len(chain) // across)
     drawing = Drawing(9, 0.35 + 1.75 * down)
-
-    def wave(degrees: np.ndarray, turns: int) -> np.ndarray:
-        """Returns a constant, a cosine and a sine, (m, 3), with ``turns`` periods a turn."""
-        angle = turns * np.radians(degrees)
-        return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
-
-    for i, (box, (at, along, unit)) in enumerate(zip(drawing.panels(across, down, gap=34), points, strict=False)):
-        axes, turns = Axes(drawing, box, limits(at), y), turns_of.get(i + 1)
+    for i, (box, (at, along)) in enumerate(zip(drawing.panels(across, down, gap=34), points, strict=False)):
+        axes = Axes(drawing, box, limits(at), y)
+        unit = "mm" if chain.prismatic[i] else "deg"
         axes.frame(f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
         axes.level(0, "#9aa0a8")
         axes.marks(at, along, "dot", 3 if len(at) <= FEW else 1.4, colour)
-        if turns and len(at) > 3:
-            fitted = np.linalg.lstsq(wave(at, turns), along, rcond=None)[0]
-            x = np.linspace(at.min(), at.max(), 100)
-            axes.lines([(x, wave(x, turns) @ fitted)], INK, 1.2)
     return drawing
 
 
 def residual_plot(*drawn) -> Html:
     """Returns the figure of residuals by joint, of the arguments of :func:`joints_figure`."""
-    caption = "Residual along each joint's own motion, by the joint's value; a curve where residuals go with its angle"
+    caption = "Residual along each joint's own motion, by the joint's value"
     return plot(partial(joints_figure, *drawn), "Residuals by joint", caption)

@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, rms
-from stcal.io.table import QUATERNION, csv_text
+from stcal.io.table import POSE, QUATERNION, csv_text
 from stcal.report.document import (
     Answer,
     Block,
@@ -142,7 +142,7 @@ def verification_figure(result: Verification) -> Drawing:
     return drawing
 
 
-def verification_report(result: Verification) -> Document:
+def verification_report(result: Verification, where: str) -> Document:
     """Returns the report of ``verify``."""
 
     def reduced(k: int, name: str) -> str:
@@ -160,7 +160,7 @@ def verification_report(result: Verification) -> Document:
         for i, (pose, distance) in enumerate(zip(result.poses[1:], result.distance_mm, strict=True))
     ]
     answer = [
-        alarms(result.warnings()),
+        alarms(result.warnings),
         Table(["<set"] + ["mm", "less by"] * 4, rows, over),
         "mean, std and max are of absolute errors, which all include the error of the first position; the RMS over all "
         "pairs depends less on any one",
@@ -173,7 +173,7 @@ def verification_report(result: Verification) -> Document:
     table = Table(["pose", "commanded distance mm", *(f"{e.name}: error mm" for e in result.sets)], errors)
     return Document(
         "Verification",
-        f"{result.where}: distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), "
+        f"{where}: distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), "
         "measured against commanded",
         [Section("Result", answer, terminal=True), Section("Poses", [table])],
     )
@@ -311,36 +311,24 @@ def _verdicts(result: Evaluation) -> list[str]:
 
 @require_arguments
 def evaluated_csv(result: Evaluation) -> str:
-    """Returns the table of residuals, with a row for each measurement.
-
-    Parameters
-    ----------
-    result : Evaluation
-
-    Returns
-    -------
-    str : CSV in mm and degrees (form: ``data_layout.md``).
-    """
+    """Returns the CSV of the residuals of ``result``, with a row for each measurement, mm and degrees (form:
+    ``data_layout.md``)."""
     data, robots, seen = result.seen.data, result.robots, result.seen.first
-    turned = data.rotations is not None
-
-    def cells(values: Iterable) -> list[str]:
-        return [f"{value:.6f}" for value in values]
-
-    def places(head: str, xyz: np.ndarray) -> list[tuple[str, Iterable]]:
-        return [(head.format(axis), cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
-
     columns: list[tuple[str, Iterable]] = [("line", data.lines), ("target", data.targets)]
-    joints = (joint_cells(robots[0].robot, q) for q in data.q)
-    columns += zip(joint_columns(robots[0].robot), zip(*joints, strict=True), strict=True)
+
+    def add(heads: Iterable[str], values: np.ndarray, digits: int = 6) -> None:
+        """Adds a column for each of the values (m, c)."""
+        columns.extend(zip(heads, [[f"{v:.{digits}f}" for v in each] for each in values.T], strict=True))
+
+    add(joint_columns(robots[0].robot), data.q * robots[0].robot.shown, 9)
     if data.positions is not None:
-        columns += places("{}_mm", data.positions)
+        add(POSE[:3], data.positions)
     else:
         distances, from_row = data.lengths()
-        columns += [("distance_mm", cells(distances)), ("from_row", from_row + 1)]
-    if turned:
-        quaternions = [[f"{v:.12f}" for v in column] for column in data.poses().quaternions().T]
-        columns += zip(QUATERNION, quaternions, strict=True)
+        add(["distance_mm"], distances[:, None])
+        columns.append(("from_row", from_row + 1))
+    if data.rotations is not None:
+        add(QUATERNION, data.poses().quaternions(), 12)
     wrong = dict(zip(seen.tolist(), result.wrong.astype(int).tolist(), strict=True))
     columns.append(("wrong", [wrong.get(row, "") for row in range(len(data))]))  # a distance from itself is not judged
     for each in robots:
@@ -349,13 +337,13 @@ def evaluated_csv(result: Evaluation) -> str:
         residuals[seen] = each.residuals
         if data.positions is not None:
             place = "commanded" if len(robots) == 1 else name
-            columns += places(f"{place}_{{}}_mm", each.state.tips_of(data).translation)
-            columns += places(f"{name}_residual_{{}}_mm", residuals)
+            add([f"{place}_{column}" for column in POSE[:3]], each.state.tips_of(data).translation)
+            add([f"{name}_residual_{column}" for column in POSE[:3]], residuals)
         else:
-            columns.append((f"{name}_residual_mm", cells(residuals[:, 0])))
-        columns.append((f"{name}_error_mm", cells(np.linalg.norm(residuals, axis=1))))
-        if turned:
-            columns.append((f"{name}_error_deg", cells(np.degrees(each.rotation_rad))))
+            add([f"{name}_residual_mm"], residuals)
+        add([f"{name}_error_mm"], np.linalg.norm(residuals, axis=1)[:, None])
+        if data.rotations is not None:
+            add([f"{name}_error_deg"], np.degrees(each.rotation_rad)[:, None])
     heads, values = zip(*columns, strict=True)
     return csv_text([heads, *zip(*values, strict=True)])
 
@@ -386,7 +374,7 @@ def evaluation_report(result: Evaluation) -> Document:
         robots += [
             subheading(each.name),
             *(f"{each.name}: {line}" for line in lines),
-            residual_plot(each.state, seen, found, each.good, each.left or (), colour),
+            residual_plot(each.state, seen, found, each.good, colour),
             page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
             page_only(placed_table(each.placed)),
         ]

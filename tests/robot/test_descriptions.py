@@ -319,7 +319,7 @@ GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4
         (("", ""), {"to_link": "hand"}, "--to-link hand: no such link; there are base_link, base,"),
         (("", ""), {"from_link": "l4", "to_link": "l1"}, "no joints lead from link l4"),
         (("", ""), {"to_link": "base"}, "no joint from base_link to base moves"),
-        (('child link="tool0"/></joint>', GRIP), {"from_link": "base_link"}, "give --to-link, one of grip, hand"),
+        (('child link="tool0"/></joint>', GRIP), {"from_link": "base_link"}, "give --to-link, one of hand, grip"),
         (('<parent link="l3"/>', '<parent link="l1"/>'), {}, "several links may be the tool; give --to-link, one of"),
         (("</robot>", "<xacro:if/></robot>"), {}, "has macros of xacro; expand it first"),
         (("<!-- expanded by hand -->", '<!DOCTYPE r [<!ENTITY a "b">]>'), {}, "defines entities of XML"),

@@ -2,7 +2,6 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, combinations, pairwise
 from typing import Annotated, Any, ClassVar, Literal
@@ -10,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import ByName, Finite, Matrix, Named, Part, Pose, ResultFile
@@ -47,17 +46,13 @@ STEP_RAD, STEP_MM = 1e-7, 1e-4
 EXACTLY = 1e-12  # sine of the angle of two axes below which rounding alone decides where their common normal is
 LIKELY, MANY = 2.0, 4
 """Factor by which a mirror may fit worse than reversed joints, and number of these from which on they are not tried."""
-LIKE_SIZE = 2.0
-"""Largest ratio of the distances between axes to the nominal ones, or of these to them; wrong units differ by more."""
+LIKE_SIZE = 2.0  # largest ratio of the lengths to the nominal ones, or of these to them; wrong units differ by more
 AGREES_RAD = np.radians(10.0)
 """Largest difference of axes and joint zeros from a nominal robot that is the same, and counts alike."""
 MOVED_SHARE = 0.5
 """Share of the squared residuals beyond which a move along the order of the rows is named: gear errors vary with the
 order too."""
-FEW = 3  # largest number of outliers of a joint that are named one by one
-ONE_LINE_MM = 10.0  # largest distance between axes that are meant to be one line, such as those of a SCARA's spindle
-REFITTED = 200
-"""Largest number of rows of which each is left out by a new fit; of more, by influence, which is 1 to 4 % less."""
+FEW = 3  # largest number of outliers of a joint that are named
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,18 +72,16 @@ class Pair:
     refused: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LeaveOneOut:
-    """The values of each pair without one row of the sweeps. ``lines`` : first line of each row left out; ``distance``,
-    ``normal`` : (r, n − 1) mm, as in :class:`Pair`, or nan."""
+class LeaveOneOut(Part):
+    """The values of each pair without one row of the sweeps; :class:`AxesFile` describes the fields."""
 
-    lines: tuple[int, ...]
-    distance: np.ndarray
-    normal: np.ndarray
+    lines: list[int]
+    distance: Rows
+    normal: Rows
 
     def spread(self, name: str) -> np.ndarray:
         """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""
-        values = getattr(self, name)
+        values = np.array(getattr(self, name), float)
         return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)  # without nan, where there is any other
 
 
@@ -126,12 +119,6 @@ class AxesResult:
 OfAxis = Annotated[AxisFit, Named("world_from_axis covariance rms_mm sigma_mm redundancy span arcs radii heights")]
 
 
-class LeaveOneOutRows(Part):
-    lines: list[int]
-    distance: Rows
-    normal: Rows
-
-
 class AxesFile(ResultFile):
     """The result file of ``axes``."""
 
@@ -154,8 +141,9 @@ class AxesFile(ResultFile):
         "`normal_mm`, `foot_mm` and their σ `normal_sigma_mm`, `foot_sigma_mm`: the common normal, and its foot along "
         'the first axis from where that was measured; `refused`: why these must not be used, or `""`'
     )
-    without_one: LeaveOneOutRows = Field(
-        description="`lines` of the rows left out, `distance`, `normal` of each pair without them, mm, signed as `a`"
+    without_one: LeaveOneOut = Field(
+        description="`lines` of the rows left out, `distance`, `normal` of each pair without them, mm, signed as `a`; "
+        "to first order"
     )
     notes: list[str] = Field(description="rows, reflectors and arcs not used, columns not read, conventions of angles")
 
@@ -197,18 +185,19 @@ def robot_from_sweeps(
     arcs, notes = find_arcs(data, nominal, still_rad)
     fits, covariance, unwound, passed = fit_axes(data, nominal, arcs, virtual)
     frames = [fit.world_from_axis for fit in fits]
-    _require_like_nominal(data.where, frames, nominal)
+    _require_signs(data.where, frames, nominal)
     axes = _chain_through(frames, nominal)
     tools, spread = _tools(data, frames[-1], unwound)
     if virtual is not None:
         tools, spread = virtual.tools(tools, spread)
     robot = robot_from_chain(axes, tools, nominal)
+    _require_build(data.where, robot, nominal)
     if virtual is None:
         orientation = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
         robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
     slopes, rows = slopes_of(frames, nominal), 5 * len(frames)
     pairs = pairs_of(frames, slopes, covariance, nominal, sum(abs(row.a) + abs(row.d) for row in robot.rows))
-    notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot, nominal)]
+    notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot)]
     notes += [
         f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"
@@ -331,24 +320,12 @@ def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.ndarray
     return np.concatenate([cosines, moments, np.linalg.det(z[three])])
 
 
-def _apart(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> float:
-    """Returns the sum of the distances of revolute axes; of two nearly parallel ones, the distance across them."""
-    total = 0.0
-    for i, k in combinations(np.flatnonzero(~sliding), 2):
-        between, normal = origin[k] - origin[i], np.cross(z[i], z[k])
-        sine = np.linalg.norm(normal)
-        parallel = sine < np.sin(AGREES_RAD)
-        total += np.linalg.norm(np.cross(between, z[i])) if parallel else abs(between @ normal) / sine
-    return float(total)
-
-
-def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> None:
-    """Refuses mirrored positions, joints with reversed sign, and an arm of another build."""
+def _require_signs(where: str, frames: list[Rigid], nominal: Robot) -> None:
+    """Refuses mirrored positions, and joints with reversed sign."""
     n, sliding = len(frames), nominal.prismatic
     rotation, origins = joint_frames(nominal.chain(), np.zeros((1, n)))
-    wanted, origin = rotation[:, 0, :, 2], origins[:, 0]
+    shape = _shape(rotation[:, 0, :, 2], origins[:, 0], sliding)
     directions, places = np.array([f.rotation[:, 2] for f in frames]), np.array([f.translation for f in frames])
-    shape = _shape(wanted, origin, sliding)
 
     def off(sign: np.ndarray, mirror: float = 1.0) -> float:
         """Returns how far the axes are off the nominal ones after changes of sign (n,), and a mirror if −1."""
@@ -361,7 +338,6 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
         for flipped in chain.from_iterable(combinations(range(n), k) for k in range(1, MANY))
     }
     best = min(reversed_, key=lambda flipped: reversed_[flipped])
-    apart, right = _apart(directions, places, sliding), _apart(wanted, origin, sliding)
     named, robot = ", ".join(str(i + 1) for i in best), f"robot {nominal.name}"
     if mirrored < as_it_is / 2 and mirrored <= LIKELY * reversed_[best]:
         fault = f"{where}: the axes are the mirror image of {robot}'s: positions of a left-handed frame"
@@ -370,20 +346,24 @@ def _require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> No
     if reversed_[best] < as_it_is / 2:
         fault = f"{where}: joint {named} counts against {robot}'s"
         raise InputError("E-AXES-SIGN", f"{fault}; correct alpha in the robot file or the sign of its values")
-    if right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
-        fault = f"{where}: the axes lie {apart / right:.3g} times as far apart as {robot}'s"
-        raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
-    angles = [np.degrees(np.arccos(np.clip((z[:-1] * z[1:]).sum(1), -1, 1))) for z in (directions, wanted)]
-    for i, (angle, nominal_angle) in enumerate(zip(*angles, strict=True), 1):
-        if abs(angle - nominal_angle) > np.degrees(AGREES_RAD):
-            fault = f"axes of joints {i} and {i + 1} are {angle:.1f}° apart, {nominal_angle:.1f}° in {robot}"
+
+
+def _require_build(where: str, robot: Robot, nominal: Robot) -> None:
+    """Refuses an arm of other angles between its axes, or of other lengths, than the nominal one."""
+    for i, (row, drawn) in enumerate(zip(robot.rows, nominal.rows, strict=True), 1):
+        if abs(row.alpha - drawn.alpha) > AGREES_RAD:
+            alpha, nominal_alpha = np.degrees([row.alpha, drawn.alpha])
+            fault = f"{where}: alpha of row {i} is {alpha:.1f}°, {nominal_alpha:.1f}° in robot {nominal.name}"
             remedy = "correct its alpha or theta, or the sign with which a joint counts"
-            raise InputError("E-AXES-ANGLE", f"{where}: {fault}; {remedy}")
+            raise InputError("E-AXES-ANGLE", f"{fault}; {remedy}")
+    # of all rows but d of the first and the last, which the axes do not tell
+    found, drawn = (sum(abs(r.a) for r in b.rows) + sum(abs(r.d) for r in b.rows[1:-1]) for b in (robot, nominal))
+    if drawn > 0 and not 1 / LIKE_SIZE < found / drawn < LIKE_SIZE:
+        fault = f"{where}: the axes lie {found / drawn:.3g} times as far apart as robot {nominal.name}'s"
+        raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
 
 
-def _remarks(
-    measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
-) -> list[str]:
+def _remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot) -> list[str]:
     """Returns remarks on the axes, their robot, and moves between the rows ``measured``, ``data`` with virtual ones."""
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
@@ -395,15 +375,12 @@ def _remarks(
         return f"line {data.lines[row]}, {called(data.targets[row])}"
 
     for fit in fits:
-        joint, off, limit = f"joint {fit.joint + 1}", fit.off_mm, f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm"
-        if len(off) > FEW:
-            first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off.items())[:FEW])
-            rows = f"{len(off)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; left out"
-            notes.append(f"{joint}: {rows}; the farthest are lines {first}; all are in --json")
-        else:
-            sizes = off.items()
-            notes += [f"{at(row)}: {size:.3g} mm off its arc about {joint}, {limit}; left out" for row, size in sizes]
-        unused = f"too close to the axis of {joint} to tell of it; its arc is not used"
+        if off := fit.off_mm:
+            farthest = "; ".join(f"{at(row)} ({size:.3g} mm)" for row, size in list(off.items())[:FEW])
+            limit = f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out, and listed in --json"
+            rows = f"{len(off)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}"
+            notes.append(f"joint {fit.joint + 1}: {rows}; the farthest: {farthest}")
+        unused = f"too close to the axis of joint {fit.joint + 1} to tell of it; its arc is not used"
         notes += [f"{at(arc.rows[0])}: {unused}" for arc in fit.near]
     swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
     for name in dict.fromkeys(each for each in data.targets if each not in swept):
@@ -411,19 +388,13 @@ def _remarks(
         what = called(name) if name else "rows without a target, beside rows with one"
         alone = "so that its place on the flange rests on these rows alone; name it like the others, or leave it out"
         notes.append(f"line {line}: {what}: on no arc of any joint ({count} rows), {alone}")
-    for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
-        after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
-        one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
-        if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
-            theta, drawn = np.degrees([row.theta, wanted.theta])
-            said = f"theta is {theta:.2f}°, {drawn:.2f}° in the robot file: its zero position differs"
-            notes.append(f"joint {i + 1}: {said}")
     moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(measured, "position"), MOVED_SHARE)
     return notes if moved is None else [*notes, moved.sentence()]
 
 
 def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> LeaveOneOut:
-    """Returns the values of the pairs without each row; ``slopes`` : of these by the joints' own fits."""
+    """Returns the values of the pairs without each row, by its influence; ``slopes`` : of :func:`_values` by the
+    joints' own fits."""
     groups, counts = defaultdict(list), Counter()  # rows measured together: the same joint values, each reflector once
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
         key = q.tobytes()
@@ -431,34 +402,8 @@ def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slop
         groups[key, counts[key, target]].append(row)
     used = np.unique(np.concatenate([fit.rows for fit in fits]))
     instants = [rows for rows in groups.values() if np.isin(rows, used).any()]
-    many = len(instants) > REFITTED
-    every = _by_influence(instants, fits, nominal, slopes) if many else _refitted(data, instants, fits, nominal)
+    changes = np.concatenate([fit.influence(instants) for fit in fits], axis=1)
+    every = _values([fit.world_from_axis for fit in fits], nominal) + changes @ slopes.T
     values = every[:, 5 * len(fits) :].reshape(len(instants), -1, 6)
-    return LeaveOneOut(tuple(int(data.lines[rows[0]]) for rows in instants), values[:, :, 3], values[:, :, 4])
-
-
-def _refitted(data: Measurements, instants: list[list[int]], fits: list[AxisFit], nominal: Robot) -> np.ndarray:
-    """Returns :func:`_values` (r, v) without each instant's rows, nan if the rest determines no axis; what comes after
-    a changed axis is unwound and fitted again."""
-    kinematic, points = (data.q @ nominal.coupling.T).T, [np.array(data.points())]
-    for fit, value in zip(fits, kinematic, strict=True):
-        points.append(fit.unwound(points[-1], value)[1])
-    values = np.full((len(instants), 11 * len(fits) - 6), np.nan)
-    for found, rows in zip(values, instants, strict=True):
-        first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
-        again, at = fits[:first], points[first]
-        with suppress(DegenerateError, ConvergenceError):
-            for fit, value in zip(fits[first:], kinematic[first:], strict=True):
-                again = [*again, fit.without(at, rows)]
-                at = again[-1].unwound(at, value)[1]
-            found[:] = _values([fit.world_from_axis for fit in again], nominal)
-    return values
-
-
-def _by_influence(instants: list[list[int]], fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> np.ndarray:
-    """Returns :func:`_values` (r, v) without each instant's rows, to first order."""
-    number = {row: i for i, rows in enumerate(instants) for row in rows}
-    changes = [np.zeros((len(instants), len(fit.gain))) for fit in fits]
-    for change, fit in zip(changes, fits, strict=True):
-        np.add.at(change, [number[row] for row in fit.rows.tolist()], fit.influence())
-    return _values([fit.world_from_axis for fit in fits], nominal) + np.concatenate(changes, axis=1) @ slopes.T
+    lines = [int(data.lines[rows[0]]) for rows in instants]
+    return LeaveOneOut(lines=lines, distance=values[:, :, 3], normal=values[:, :, 4])

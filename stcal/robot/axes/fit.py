@@ -30,7 +30,7 @@ NEAR_AXIS = 10.0
 ROUNDING = 1e-12  # relative size of the rounding error of coordinates
 WEAK_RAD = 0.02  # σ of a direction beyond which an axis is not known; its covariance is valid for small angles only
 MOTION = np.radians(2.0)
-"""Largest difference of the observed motion from the joint's values, or share of a sliding joint's way."""
+"""Largest difference of the observed motion from the joint's values, as a share of the radius or of the way."""
 QUIET = 1e-3
 """Share of the largest arc below which residuals are too small to hide a gross error that bent the first axis."""
 STARTS, REWEIGHTINGS = 60, 30
@@ -38,7 +38,6 @@ WEIGHTS_SETTLED = 1e-3
 """Change of the weights below which they have converged; it moves an axis by less than a thousandth of its σ."""
 SINGULAR, TINY = 1e-10, 1e-300
 """Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
-FIRST_SIZE = 0.05  # size of an arc, as a share of the largest, from which on it is used for the first axis
 SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0  # distances of virtual reflectors from the target that make sense
 SEPARATOR = " point "
 
@@ -58,12 +57,9 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
 
     Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
     """
-    if data.positions is None:
-        remedy = "columns x_mm, y_mm, z_mm needed for the axis method"
-        raise InputError("E-MEASURED-DISTANCES", f"{data.where}: distances only; {remedy}")
-    names = np.array(data.targets)
+    names, places = np.array(data.targets), data.points()
     for target in dict.fromkeys(data.targets):
-        points = data.positions[names == target]
+        points = places[names == target]
         far = float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
         if len(points) > 1 and far < STANDS_STILL_MM:
             near = f"90 % of its {len(points)} positions lie within {far:.3g} mm while the joints move"
@@ -164,13 +160,10 @@ def ring(length_mm: float) -> np.ndarray:
 def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
     """Returns reflectors carried at ``places`` (k, 3) of a target, mm; raises InputError if there are no
     orientations."""
-    if data.rotations is None or data.positions is None:
-        remedy = "columns of a rotation needed for --orientations, or leave it out"
-        raise InputError("E-MEASURED-NO-ORIENTATION", f"{data.where}: no orientations; {remedy}")
-    m, k = len(data), len(places)
+    m, k, rotations = len(data), len(places), data.poses().rotation
     about = places - places.mean(axis=0)
     lever = about / np.sqrt((about**2).sum(axis=1).mean())
-    carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
+    carried, lever = (np.einsum("mij,kj->mki", rotations, each).reshape(-1, 3) for each in (places, lever))
     row = np.repeat(np.arange(m), k)
     many = replace(data, rotations=None, covariance=None, common=None)[row]
     names = tuple(f"{target}{SEPARATOR}{n % k + 1}" for n, target in enumerate(many.targets))
@@ -286,17 +279,18 @@ class AxisFit:
         """Returns the lengths (k',) of the residuals of the points used, mm."""
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
 
-    def influence(self) -> np.ndarray:
-        """Returns the change (k, p) of the axis, linear, without each of its points (Cook & Weisberg 1982)."""
-        step = self._inverse()
+    def influence(self, left_out: Sequence[Sequence[int]]) -> np.ndarray:
+        """Returns the change (i, p) of the axis, linear, without each of i sets of rows (Cook & Weisberg 1982)."""
+        step, jacobian = self._inverse(), self._jacobian()
         sums = np.maximum(self.member @ (self.weights @ self.member), TINY)
-        lever = (self.weights / sums)[:, None, None] * np.eye(2) - self._jacobian() @ step
-        return -(step @ np.linalg.solve(np.eye(2) - lever, self.residuals[:, :, None]))[:, :, 0]
-
-    def without(self, points: np.ndarray, left_out: Sequence[int]) -> "AxisFit":
-        """Returns the axis from moved points (m, 3), without the rows ``left_out``; the weights are kept."""
-        weights = np.where(np.isin(self.rows, left_out), 0.0, self.weights)
-        return replace(self, points=points[self.rows], weights=weights)._descended()
+        changes = np.zeros((len(left_out), step.shape[1]))
+        for change, rows in zip(changes, left_out, strict=True):
+            at = np.isin(self.rows, rows)
+            by_residual = np.concatenate([np.zeros((change.size, 0)), *step[at]], axis=1)
+            kept = np.eye(by_residual.shape[1]) + jacobian[at].reshape(-1, change.size) @ by_residual
+            kept -= np.diag(np.repeat((self.weights / sums)[at], 2))
+            change[:] = -by_residual @ np.linalg.solve(kept, self.residuals[at].ravel())
+        return changes
 
     def unwound(self, points: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the rotations (m, 3, 3) that undo the joint's values (m,), and points (m, 3) after that."""
@@ -337,18 +331,15 @@ class AxisFit:
         for each in (np.arange(count), np.unique(moved, return_inverse=True)[1]):
             groups = each % STARTS
             sets += [groups != out for out in np.unique(groups) if each.max() > 1]
-        least, best = np.inf, None
-        for i, subset in enumerate(sets):
+        tried = []
+        for subset in sets:
             fit = replace(self, weights=np.asarray(subset, float))
             fit = replace(fit, world_from_axis=fit._linear_start())
             length, sigma, _ = fit._robust()
-            if np.median(length) < least:
-                least, best = np.median(length), fit
-            if i == 0 and length.max() <= min(GROSS * sigma, QUIET * self.size):
-                break
-        return best or self._undetermined(
-            f"no axis follows from any {count - 1} of its {count} positions; check them, or measure the sweep again"
-        )
+            if not tried and length.max() <= min(GROSS * sigma, QUIET * self.size):
+                return fit
+            tried.append((float(np.median(length)), fit))
+        return min(tried, key=lambda each: each[0])[1]
 
     def _linear_start(self) -> Rigid:
         """Returns the axis by the arcs' common scatter and the circles' common centre (Kåsa 1976)."""
@@ -431,40 +422,24 @@ class AxisFit:
         direction, place = np.linalg.norm(sigma[:2]), np.linalg.norm(sigma[2:])
         if direction <= WEAK_RAD and place <= most_mm:
             return
-        if self.size < STANDS_STILL_MM:
-            fault = f"its reflectors stay within {self.size:.3g} mm of one position while its values change"
-            remedy = "check that it moved and that each position was measured again, or put a reflector off its axis"
-            self._undetermined(f"{fault}; {remedy}", "E-AXES-STILL")
         fault = f"σ of the direction of its axis is {np.degrees(direction):.2g}° and of its place {place:.2g} mm"
         needed = f"{np.degrees(WEAK_RAD):.1f}° and {most_mm:.2g} mm needed"
-        self._undetermined(f"{fault}, {needed}; sweep further, or with reflectors farther apart")
+        remedy = "check that each position was measured anew; sweep further, or with reflectors farther apart"
+        self._undetermined(f"{fault}, {needed}; {remedy}")
 
     def oriented(self, moved: np.ndarray) -> "AxisFit":
         """Returns the axis with z along positive motion; refuses motion that does not match the values (m,)."""
-        moved, local = moved[self.rows], self.local
-        if self.prismatic:
-            travel = self.demean(np.column_stack([local[:, 2], moved]))
-            turned = (self.weights * travel[:, 0]) @ travel[:, 1] < 0
-            deviation = np.abs((-1 if turned else 1) * travel[:, 0] - travel[:, 1])
-            allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma_mm, "mm", 1.0
-        else:
-            place = local[:, 0] + 1j * local[:, 1]
-            back = place * np.exp(-1j * np.array([[1], [-1]]) * moved)  # turned back by the values, and by minus these
-            arms = back @ (self.member * self.weights[:, None])
-            turned = bool(np.abs(arms[1]).sum() > np.abs(arms[0]).sum())
-            deviation = np.abs(np.angle(back[int(turned)] * (self.member @ arms[int(turned)]).conj()))
-            near = GROSS * self.sigma_mm / np.maximum(np.abs(place), TINY)
-            allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
-        wrong = (deviation > allowed) & (self.weights > 0)
+        moved, axis = moved[self.rows], self.world_from_axis
+        ways = [replace(self, world_from_axis=Rigid(axis.rotation * [1, s, s], axis.translation)) for s in (1, -1)]
+        off = [np.linalg.norm(self.demean(way.unwound(self.points, moved)[1]), axis=1) for way in ways]
+        turned = int(np.argmin([self.weights @ each**2 for each in off]))
+        way_mm = np.ptp(moved) if self.prismatic else self.values[:, 0]
+        wrong = (off[turned] > MOTION * way_mm + GROSS * self.sigma_mm) & (self.weights > 0)
         if wrong.any():
-            most = f"{deviation[wrong].max() * shown:.3g} {unit}"
             remedy = "check the column's unit, the coupling in the robot file, and that positions and rows match"
-            fault = f"{self.where}: the motion seen is off its values by up to {most}"
+            fault = f"{self.where}: the motion seen is off its values by up to {off[turned][wrong].max():.3g} mm"
             raise InputError("E-AXES-JOINT-VALUES", f"{fault}; {remedy}")
-        axis = self.world_from_axis
-        if turned:
-            axis = Rigid(axis.rotation * [1, -1, -1], axis.translation)
-        return replace(self, world_from_axis=axis, span=float(np.ptp(moved)))
+        return replace(ways[turned], span=float(np.ptp(moved)))
 
 
 def _motions(xyz: np.ndarray, axes: np.ndarray, sliding: bool) -> np.ndarray:
@@ -498,16 +473,11 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
         member = np.repeat(np.eye(len(used)), [len(arc.rows) for arc in used], axis=0)
         return AxisFit(where, prismatic, used, rows, points[rows], member, largest, np.ones(len(rows)), start)
 
-    use = size >= FIRST_SIZE * size.max()
-    fit = of(use, Rigid()).solved(moved)
-    if not prismatic and not use.all():
-        across = (points - fit.world_from_axis.translation) @ fit.world_from_axis.rotation[:, :2]
-        radius = np.array([np.hypot(*across[arc.rows].T).mean() for arc in arcs])
-        more = ~use & (radius > NEAR_AXIS * fit.sigma_mm)
-        if more.any():
-            use |= more
-            fit = of(use, fit.world_from_axis).solved(None)
-    return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(~use)))
+    fit = of(np.ones(len(arcs), bool), Rigid()).solved(moved)
+    near = np.array(fit.radii) <= NEAR_AXIS * fit.sigma_mm
+    if near.any():
+        fit = of(~near, fit.world_from_axis).solved(None)
+    return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(near)))
 
 
 def fit_axes(

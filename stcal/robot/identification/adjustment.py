@@ -341,13 +341,9 @@ class ObservabilityIndices:
 
     @classmethod
     def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
-        """Returns the indices by singular values (L,) of ``count`` poses, all 0 if one value is 0; raises
-        InputError."""
-        sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
-        if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
-            fault = f"observability: {len(sigma)} singular values of {count} poses"
-            raise InputError("E-ARRAY-SHAPE", f"{fault}; at least one of each, none negative")
-        first, last = float(sigma[0]), float(sigma[-1])
+        """Returns the indices by singular values (L,) of ``count`` poses, all 0 if one value is 0."""
+        sigma = np.asarray(singular_values, float)
+        first, last = float(sigma.max()), float(sigma.min())
         if last == 0:
             return cls(0.0, 0.0, 0.0, 0.0, 0.0)
         volume = float(np.exp(np.log(sigma).mean()) / np.sqrt(count))

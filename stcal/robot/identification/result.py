@@ -470,11 +470,7 @@ def _lengths(result: Identified) -> list[str]:
 def _stated_otherwise(result: Identified) -> list[str]:
     """Returns a note on stated σ that are far from what the residuals show."""
     sigma, kind = result.weighting, result.seen.kind
-    few = np.count_nonzero(result.weights < GROSS)
     remedy = "check --sigma-mm and --sigma-rad, or covariances, and their units; or leave them out, to have σ estimated"
-    if 2 * few > len(result.weights):
-        said = f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small"
-        return [f"{said}: {remedy}"]
     ratios = {"residuals": sigma.factor}
     if not sigma.given:
         medians = replace(sigma, estimated=()).medians(sigma.factor * sigma.whiten(result.residuals, result.seen))

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from scipy.optimize import least_squares
 
+from stcal.adjust.blocks import Vector
+from stcal.adjust.engine import Adjustment
 from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import rms
-from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, by_pose
 from stcal.io.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
@@ -43,8 +44,6 @@ GUESS_ROWS = 60
 MOST_JOINTS = 8  # largest number of joints of which two at a time are tried
 LEAST_ORIENTATIONS = 5
 """Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
-PROBED, MOST_MOVES = 8, 4
-"""Number of rows by which the place of an instrument is found again, and largest number of times that it moves."""
 AROUND = 0.1
 """Distance from the given tool point at which distances are fitted from other starts, as a share of the reach."""
 
@@ -160,7 +159,6 @@ def _base_and_points(
     robot: Robot, where: str, flange: Poses, positions: np.ndarray, rows: np.ndarray, points: np.ndarray, fit: Fit
 ) -> tuple[Rigid, np.ndarray]:
     """Returns base and tool points (t, 3) by least squares, mm; the given ones where they are not in ``fit``."""
-    free = np.array(["base" in fit] * 6 + ["tool" in fit] * points.size)
     try:
         base = align_rigid(positions, flange @ points[rows]) if "base" in fit else robot.world_from_base
     except DegenerateError as error:
@@ -170,29 +168,24 @@ def _base_and_points(
         raise DegenerateError("E-IDENTIFY-UNDETERMINED", f"{fault}; {remedy}") from error
     if not fit:
         return base, points
-    moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
-    spread = position_errors(positions - positions.mean(0)).max()
-    information = (np.array([spread] * 3 + [1.0] * (3 + points.size)) / USELESS_MM) ** 2
+    problem = Adjustment()
+    frame = problem.block("base", Poses.of([base]), fixed=() if "base" in fit else (0,))
+    tips = problem.block("points", Vector(points), fixed=() if "tool" in fit else range(len(points)))
+    problem.prior(tips, points, np.eye(points.size) / USELESS_MM**2)
 
-    def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
-        points_base = flange @ at[1][rows]
-        turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
-        by_base = by_pose(np.tile(np.eye(3), (len(rows), 1, 1)), points_base @ at[0].rotation.T)
-        derivative = np.concatenate([by_base, turned], axis=2)
-        errors = (at[0] @ points_base - positions).ravel()
-        held = NormalEquations(float(at[2] @ (information * at[2])), np.diag(information), information * at[2])
-        return NormalEquations.of(errors, free * derivative.reshape(-1, derivative.shape[2])) + held
+    def errors(bases: Poses, tools: Vector) -> np.ndarray:
+        return bases[0] @ (flange @ tools.array[rows]) - positions
 
-    minimum = minimise(
-        (base, points, np.zeros(len(information))),
-        linearise,
-        lambda at, step: (at[0].moved(step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
-        least_damping=REGULAR,
-        settled=SETTLED,
-        max_steps=ROUNDS,
-    )
+    def derivatives(bases: Poses, tools: Vector) -> list[np.ndarray]:
+        turn = bases.rotation[0]
+        by_base = by_pose(np.tile(np.eye(3), (len(rows), 1, 1)), (flange @ tools.array[rows]) @ turn.T)
+        return [by_base, turn @ flange.rotation]
+
+    problem.factor(errors, [(frame, None), (tips, rows)], derivatives=derivatives)
+    minimum = problem.minimum(least_damping=REGULAR, settled=SETTLED, max_steps=ROUNDS)
     accepted = NEARLY * float(minimum.linear.cost)
-    return minimum.required(f"{where}: base and tools", "check the D-H rows and the joint values", accepted).state[:2]
+    found = minimum.required(f"{where}: base and tools", "check the D-H rows and the joint values", accepted).state
+    return found["base"][0], found["points"].array
 
 
 def _points_of_distances(
@@ -222,21 +215,18 @@ def _explanation(robot: Robot, data: Measurements, tools: dict[str, Rigid], misf
     if data.positions is not None:
         thinned = data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
     mistakes = chain(*(kind(robot, thinned) for kind in (_of_values, _of_rows, _of_order)), _of_frames(robot, data))
-    levels = [("", robot, data)], mistakes, _moves_of(robot, data, tools)
-    most, found = min(EXPLAINS * misfit, FITS), []
-    for level in levels:  # one after the other: what a level tries may be impossible where an earlier one explains
-        cases = (Candidate(what, partial(tuple, case)) for what, *case in level)
-        if found := explain(cases, lambda case: _fitting(case, tools)[0], most):
-            break
+    cases = [Candidate(what, partial(tuple, case), len(what) > 0) for what, *case in (("", robot, data), *mistakes)]
     words = []
-    for each, _ in found[:MOST_NAMED]:
+    for each, _ in explain(cases, lambda case: _fitting(case, tools)[0], min(EXPLAINS * misfit, FITS))[:MOST_NAMED]:
         guess, far = each.change()[1], _fitting(each.change(), tools)[1]
         lines = [str(guess.lines[row]) for row in np.flatnonzero(far)]
         shown = ", ".join(lines[:SHOWN]) + (", …" if len(lines) > SHOWN else "")
         rows = f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
         words.append(", and ".join(filter(None, (each.words, rows if lines else ""))))
+    if words:
+        return f"it would fit if {', or if '.join(words)}"
     cause = "check D-H rows and convention, the order and zero of joints, coupling, and units"
-    return f"it would fit if {', or if '.join(words)}" if words else cause
+    return f"{cause}; if instrument or target moved, name the rows from there on in a column station or target"
 
 
 def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
@@ -255,34 +245,6 @@ def _fitting(case: tuple[Robot, Measurements], tools: dict[str, Rigid]) -> tuple
         if share < FITS or (near == before).all() or near.mean() < MOSTLY_NEAR:
             break
     return share, ~near
-
-
-def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
-    """Yields the rows before instrument, base or target moved, if the rows between moves all fit by themselves."""
-    if data.positions is None or robot.tree:
-        return
-    starts, far_mm = [0], FITS * _extent(data)
-    while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
-        state, misfit = _placed(robot, data[first : first + PROBED], tools)
-        far = position_errors(state.residuals(observed(data[first:], "position"))) > far_mm
-        if misfit > far_mm or not far.any():
-            break
-        starts.append(first + int(far.argmax()))
-    ends = [*starts[1:], len(data)]
-    if not 1 < len(starts) <= MOST_MOVES + 1 or min(np.subtract(ends, starts)) < PROBED:
-        return
-    pieces = [data[first:end] for first, end in zip(starts, ends, strict=True)]
-    if any(_placed(robot, each, tools)[1] > FITS * _extent(each) for each in pieces):
-        return
-    stations = tuple(str(k) for k, piece in enumerate(pieces) for _ in range(len(piece)))
-    try:
-        _with_stations(robot, replace(data, stations=stations), BOTH)
-        what, column = "the instrument, or the robot's base, had", "station"
-    except InputError:
-        what, column = "the target, and perhaps the instrument, had", "target"
-    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
-    what = f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}"
-    yield f"{what}; name the rows from there on in column {column}", robot, pieces[0]
 
 
 def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
@@ -305,16 +267,12 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
         remedy = f"check its direction in the rows, or the sign of q{i + 1}"
         reversed_ = replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
         yield f"joint {i + 1} had the opposite sign; {remedy}", robot, reversed_
-    if (robot.coupling != np.eye(n)).any():
-        what = "the joints were not coupled; take coupling out of the robot file"
-        yield what, replace(robot, coupling=np.eye(n)), data
-        what = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
-        yield what, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
-    elif n >= 3:
-        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
-            coupling = np.eye(n)
-            coupling[2, 1] = sign
-            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
+    makers = {0.0: "", 1.0: ", as Fanuc's are", -1.0: ", as those of parallel linkages are"}
+    for sign, whose in makers.items() if n >= 3 else ():
+        coupling = np.eye(n)
+        coupling[2, 1] = sign
+        if (coupling != robot.coupling).any():
+            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}{whose}; give coupling in the robot file so"
             yield what, replace(robot, coupling=coupling), data
 
 
@@ -336,19 +294,13 @@ def _of_rows(robot: Robot, data: Measurements) -> Iterator[Case]:
 
 
 def _of_order(robot: Robot, data: Measurements) -> Iterator[Case]:
-    """Yields columns or rows in another order."""
+    """Yields columns in another order."""
     q, sliding, n = data.q, robot.prismatic, len(robot.rows)
     for i, k in combinations(range(n), 2) if n <= MOST_JOINTS else ():
         if sliding[i] == sliding[k]:
             order = [{i: k, k: i}.get(r, r) for r in range(n)]
             what = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
             yield what, robot, replace(data, q=q[:, order])
-            if not robot.tree:
-                what = f"rows {i + 1} and {k + 1} were exchanged; correct the robot file"
-                yield what, replace(robot, rows=tuple(robot.rows[r] for r in order)), data
-    if sliding.all() or not sliding.any():
-        what = "joint values were in the opposite order, the last joint first; correct the columns"
-        yield what, robot, replace(data, q=q[:, ::-1])
 
 
 def _of_frames(robot: Robot, data: Measurements) -> Iterator[Case]:
@@ -360,12 +312,6 @@ def _of_frames(robot: Robot, data: Measurements) -> Iterator[Case]:
         if len(data) > 2:
             shifted = replace(data[places], q=data.q[joints])
             yield f"joint values stood one row further {way}; {remedy}", robot, shifted
-    moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
-    if not moved.all():
-        first, last = np.flatnonzero(~moved)[[0, -1]]
-        rows = f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}"
-        what = f"{rows}, did not repeat the position of the row before them, while the joints moved"
-        yield f"{what}; leave them out, or measure again", robot, data[moved]
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
     yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
     if data.rotations is not None:

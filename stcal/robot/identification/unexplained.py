@@ -68,20 +68,23 @@ def left(
     """
     explained = state.jacobian(measured) if explained is None else explained
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
-    rows = state.residuals(measured), partial(weighting.whiten, measured=measured)
+    errors, white = state.residuals(measured), partial(weighting.whiten, measured=measured)
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
-    weights = np.ones(len(rows[0])) if weights is None else weights
-    rest = _Rest.of(*rows, explained, candidates, np.sqrt(weights) * (weights >= GROSS))
-    findings, tests = [], len(candidates) + len(order)
+    weights = np.ones(len(errors)) if weights is None else weights
+    root = np.sqrt(weights) * (weights >= GROSS)
+    findings, tests, square = [], len(candidates) + len(order), 0.0
     while len(findings) < MOST:
-        tried = rest.strongest(len(order)), _moved_meanwhile(*rows, measured.lines, order, explained, tests)
-        found = min((each for each in tried if each is not None), key=lambda each: each.log_p, default=None)
-        if found is None:
-            break
+        rest = _Rest.of(errors, white, explained, root)
+        square = max(square, float(rest.remaining @ rest.remaining))
+        by_itself = rest.strongest(candidates, len(order), square)
+        in_order = _moved_meanwhile(errors, white, measured.lines, order, explained, tests)
+        tried = [each for each in (by_itself, in_order) if each is not None]
+        if not tried:
+            return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
+        found = min(tried, key=lambda each: each.log_p)
         findings.append(found.finding)
-        explained = np.concatenate([explained, found.motions], axis=2)
-        rest = found.rest or _Rest.of(*rows, explained, candidates, found.root)
-    return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
+        explained, root = np.concatenate([explained, found.motions], axis=2), found.root
+    return tuple(findings)
 
 
 Whiten = Callable[[np.ndarray], np.ndarray]
@@ -103,81 +106,72 @@ class _Effect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """A finding with the logarithm of its probability by chance and its ``motions`` (r, w, c). ``root`` : (r,) 1 for
-    rows that are no errors beside it, else 0; ``rest`` : the residuals without it where all of these rows stay."""
+    """A finding with the logarithm of its probability by chance and its ``motions`` (r, w, c). ``root`` : (r,) roots of
+    the weights of the rows beside it, 0 for errors."""
 
     finding: Effect
     log_p: float
     motions: np.ndarray
     root: np.ndarray
-    rest: "_Rest | None" = None
 
     @classmethod
-    def of(
-        cls, finding: Effect, log_p: float, motions: np.ndarray, root: np.ndarray, rest: "_Rest | None" = None
-    ) -> "_Found | None":
+    def of(cls, finding: Effect, log_p: float, motions: np.ndarray, root: np.ndarray) -> "_Found | None":
         """Returns the finding, with its probability, if it is beyond chance, and not tiny."""
         tiny = finding.share < LEAST_SHARE or (finding.effect_mm < LEAST_MM and finding.effect_rad < LEAST_RAD)
         if tiny or log_p > np.log(LEVEL):
             return None
-        return cls(replace(finding, p=float(np.exp(min(log_p, 0.0)))), log_p, motions, root, rest)
+        return cls(replace(finding, p=float(np.exp(min(log_p, 0.0)))), log_p, motions, root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rest:
-    """The part of whitened residuals (N,) that ``fitted`` (N, k) does not explain. ``errors`` : (r, w), ``before`` :
-    (N,) whitened; ``square`` : of what remained at first; ``root`` : roots of the weights of all rows, 0 for rows left
-    out; ``effects`` : candidates with their whitened motions (N, c)."""
+    """The part ``remaining`` of whitened residuals (N,) that ``fitted`` (N, k) does not explain. ``errors`` : (r, w);
+    ``root`` : (r,) roots of the weights, 0 for rows left out; ``weighted`` : whitens values (r, w, c) to (N, c)."""
 
     errors: np.ndarray
+    root: np.ndarray
+    weighted: Whiten
     before: np.ndarray
     fitted: np.ndarray
     remaining: np.ndarray
-    square: float
     freedom: int
-    root: np.ndarray
-    effects: list[tuple[_Effect, np.ndarray]]
 
     @classmethod
-    def of(
-        cls, errors: np.ndarray, white: Whiten, explained: np.ndarray, candidates: list[_Effect], root: np.ndarray
-    ) -> "_Rest":
+    def of(cls, errors: np.ndarray, white: Whiten, explained: np.ndarray, root: np.ndarray) -> "_Rest":
         """Returns the residuals that the motions ``explained`` (r, w, k) leave of ``errors`` (r, w)."""
 
         def weighted(values: np.ndarray) -> np.ndarray:
             return (root[:, None, None] * white(values)).reshape(errors.size, -1)
 
-        good, fitted = root > 0, _basis(_unit(weighted(explained)), SAME)
-        before = weighted(errors[..., None]).ravel()
-        remaining = before - fitted @ (fitted.T @ before)
-        freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
-        effects = [(each, weighted(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
-        return cls(errors[good], before, fitted, remaining, float(remaining @ remaining), freedom, root, effects)
+        before, fitted = weighted(errors[..., None]).ravel(), _basis(_unit(weighted(explained)), SAME)
+        freedom = np.count_nonzero(root) * errors.shape[1] - fitted.shape[1]
+        return cls(errors, root, weighted, before, fitted, before - fitted @ (fitted.T @ before), freedom)
 
-    def strongest(self, others: int) -> _Found | None:
-        """Returns the candidate that explains most beyond chance; ``others`` : number of further tests."""
-        tried = [(each, test) for each, values in self.effects if (test := self._tested(values))]
+    def strongest(self, candidates: list[_Effect], others: int, square: float) -> _Found | None:
+        """Returns the candidate that explains most beyond chance; ``others`` : number of further tests; ``square`` : of
+        what remained at first."""
+        if self.freedom < LEAST_FREEDOM:
+            return None
+        tried = [(each, test) for each in candidates if (test := self._tested(self.weighted(each.motions)))]
         if not tried:
             return None
-        candidate, (log_p, takes, new) = min(tried, key=lambda each: each[1][0])
-        amplitude, width = np.sqrt(2) if candidate.turns else 1.0, self.errors.shape[1]
+        candidate, (log_p, takes) = min(tried, key=lambda each: each[1][0])
+        amplitude, good = np.sqrt(2) if candidate.turns else 1.0, self.root > 0
 
         def size(part: slice) -> float:
             """Returns the amplitude, or RMS, of what the candidate takes, rad or mm."""
-            parts = (each.reshape(-1, width)[:, part] for each in (self.errors, self.before, takes))
+            parts = (each.reshape(self.errors.shape)[good, part] for each in (self.errors, self.before, takes))
             unit, white, taken = (float((each**2).sum()) for each in parts)
-            return float(amplitude * np.sqrt(unit / np.count_nonzero(self.root) / max(white, 1e-300) * taken))
+            return float(amplitude * np.sqrt(unit / np.count_nonzero(good) / max(white, 1e-300) * taken))
 
-        mm, rad = size(slice(-3, None)), size(slice(0, 3)) if width == 6 else 0.0
-        share, fitted = float(takes @ takes) / max(self.square, 1e-300), np.hstack([self.fitted, new])
-        freedom = self.freedom - new.shape[1]
-        rest = replace(self, fitted=fitted, remaining=self.remaining - takes, freedom=freedom)
+        mm, rad = size(slice(-3, None)), size(slice(0, 3)) if self.errors.shape[1] == 6 else 0.0
+        share = float(takes @ takes) / max(square, 1e-300)
         finding = Effect(candidate.what, candidate.joint, candidate.turns, mm, rad, share, 1.0)
-        return _Found.of(finding, log_p + float(np.log(len(tried) + others)), candidate.motions, self.root, rest)
+        return _Found.of(finding, log_p + float(np.log(len(tried) + others)), candidate.motions, self.root)
 
-    def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Returns the F test of what ``values`` (N, c) add: log p, the part (N,) of the residuals that it explains, and
-        a basis (N, c) of it; None if nothing, or without degrees of freedom."""
+    def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray] | None:
+        """Returns the F test of what ``values`` (N, c) add: log p, and the part (N,) of the residuals that it explains;
+        None if nothing, or without degrees of freedom."""
         values = _unit(values)
         new = _basis(values - self.fitted @ (self.fitted.T @ values), NEW)
         c = new.shape[1]
@@ -186,7 +180,7 @@ class _Rest:
         takes = new @ (new.T @ self.remaining)
         left_over = self.remaining - takes
         ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (self.freedom - c), 1e-300)
-        return float(np.log(max(fdtrc(c, self.freedom - c, ratio), np.finfo(float).tiny))), takes, new
+        return float(np.log(max(fdtrc(c, self.freedom - c, ratio), np.finfo(float).tiny))), takes
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

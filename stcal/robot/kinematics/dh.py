@@ -1,6 +1,6 @@
 """Denavit-Hartenberg rows from a chain of axes, and checks of poses against joint values."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, replace
 from functools import partial
 
@@ -151,28 +151,25 @@ def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robo
     """Returns the robot with a first row from the chain's base and a last row to its flange, where such rows exist."""
     rows, modified = list(nominal.rows), nominal.convention == "modified"
     bare = robot_from_chain(chain, {"": Rigid()}, nominal)
-    if (end := _row_of(bare.tool(), modified=False, across_too=not modified)) is not None:
+    if (end := _row_of(bare.tool(), whole=not modified)) is not None:
         rows[-1] = end if not modified else replace(rows[-1], d=end.d, theta=end.theta)
-    if len(rows) > 1 and (begin := _row_of(bare.world_from_base, modified, across_too=modified)) is not None:
-        rows[0] = begin if modified else replace(rows[0], d=begin.d, theta=begin.theta)
+    base = bare.world_from_base
+    begin = _row_of(base.inverse() if modified else base, whole=modified)  # a modified row is a standard one backwards
+    if len(rows) > 1 and begin is not None:
+        back = (0.0 - v for v in (begin.a, begin.alpha, begin.d, begin.theta))  # not −0
+        rows[0] = DHRow(*back) if modified else replace(rows[0], d=begin.d, theta=begin.theta)
     robot = robot_from_chain(chain, tools, replace(nominal, rows=tuple(rows)))
     base = robot.world_from_base
     at_base = np.abs(base.translation).max() < ROUNDING_MM and np.abs(base.rotation - np.eye(3)).max() < ROUNDING
     return replace(robot, world_from_base=Rigid()) if at_base else robot
 
 
-def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
-    """Returns the row without β that gives this pose, or None; only its d and θ unless ``across_too``."""
-    if modified and across_too:  # the way back along a standard row
-        back = _row_of(pose.inverse(), modified=False, across_too=True)
-        return None if back is None else DHRow(0.0 - back.a, 0.0 - back.alpha, 0.0 - back.d, 0.0 - back.theta)  # not −0
+def _row_of(pose: Rigid, whole: bool) -> DHRow | None:
+    """Returns the standard row without β that gives this pose, or None; only with d and θ unless ``whole``."""
     r, p = pose.rotation, pose.translation
-    if not across_too:
-        row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))
-    else:
-        theta = float(np.arctan2(r[1, 0], r[0, 0]))
-        a = float(np.cos(theta) * p[0] + np.sin(theta) * p[1])
-        row = DHRow(a, float(np.arctan2(r[2, 1], r[2, 2])), float(p[2]), theta)
+    theta = float(np.arctan2(r[1, 0], r[0, 0]))
+    a = float(np.cos(theta) * p[0] + np.sin(theta) * p[1]) if whole else 0.0
+    row = DHRow(a, float(np.arctan2(r[2, 1], r[2, 2])) if whole else 0.0, float(p[2]), theta)
     pose_of_row = along(row) @ across(row)
     fits = np.abs(pose_of_row.rotation - r).max() < ROUNDING and np.abs(pose_of_row.translation - p).max() < ROUNDING_MM
     return row if fits else None
@@ -191,15 +188,12 @@ def require_orientations(
     model, and of the targets as read; ``many`` : False for few rows, which are refused only if quaternions of another
     convention fit. One orientation in all rows is no misreading.
     """
-    names, rows = np.array(targets, object), np.arange(len(seen))
     own = _typical_rad(targets, flange, seen)
     if own < TURNED_RAD or np.ptp(seen, axis=0).max() < NOTHING_RAD:
         return
-    readings = ((f"quaternions were {each.held}; {each.remedy}", rows, each.rotations(seen)) for each in READINGS)
-    cases = [*readings, *(_misread(seen) if many else ())]
     found = explain(
-        (Candidate(words, partial(tuple, case)) for words, *case in cases),
-        lambda case: _typical_rad(names[case[0]].tolist(), flange[case[0]], case[1]),
+        (Candidate(f"quaternions were {each.held}; {each.remedy}", partial(each.rotations, seen)) for each in READINGS),
+        lambda read: _typical_rad(targets, flange, read),
         EXPLAINS * own,
     )
     missed = f"{where}: orientations typically miss the robot by {np.degrees(own):.3g}°, {np.degrees(TURNED_RAD):.2g}°"
@@ -220,20 +214,3 @@ def _typical_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -
         off = [(tool.inv() * own).magnitude() for tool in tools]
         angles.append(min(off, key=np.median))
     return float(np.median(np.concatenate(angles)))
-
-
-def _misread(seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yields frequent misreadings of orientations in words, the rows (k,) that remain, and rotations (k, 3, 3)."""
-    rows, fixed = np.arange(len(seen)), Rotation.from_matrix(seen).as_euler("xyz")
-    moving = Rotation.from_matrix(seen).as_euler("XYZ")
-    swapped = "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)"
-    signs = zip("XYZ", 1 - 2 * np.eye(3), strict=True)
-    for words, axes, values in (
-        (swapped, "xyz", fixed[:, ::-1]),
-        *((f"the angle about {axis} had the other sign", "xyz", fixed * sign) for axis, sign in signs),
-        ("the angles were about moving axes, X first", "XYZ", fixed),
-        ("the angles were about fixed axes, X first", "xyz", moving),
-    ):
-        yield f"{words}: correct them", rows, Rotation.from_euler(axes, values).as_matrix()
-    yield "each orientation were in the line before: correct them", rows[:-1], seen[1:]
-    yield "each orientation were in the line after: correct them", rows[1:], seen[:-1]

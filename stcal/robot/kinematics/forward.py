@@ -264,10 +264,8 @@ def _by_moment(chain: Chain, rotation: np.ndarray, elasticity: Elasticity) -> np
 
 
 def _joint_vectors(q: ArrayLike, robot: Robot) -> np.ndarray:
-    values, n = np.atleast_2d(frozen(q, None, "joint values", finite=False)), len(robot.rows)
+    values, n = np.atleast_2d(frozen(q, None, "joint values")), len(robot.rows)
     if values.ndim != 2 or values.shape[1] != n:
         raise InputError("E-ARRAY-SHAPE", f"joint values: shape {values.shape}, (m, {n}) needed for {n} joints")
-    if not np.isfinite(values).all():
-        raise InputError("E-ARRAY-NOT-FINITE", "joint values: hold values that are not finite")
     warn_of_degrees(values, ~robot.prismatic, f"robot {robot.name}: joint values")
     return values

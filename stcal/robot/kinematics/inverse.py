@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, freeze, require_arguments
+from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import flange_poses, from_base, tool_jacobian
 from stcal.robot.kinematics.robot_model import Robot
@@ -112,12 +112,10 @@ def inverse(
     if near is None:
         problem.refuse_redundant()
         return problem.searched(poses, np.zeros((m, n)), np.zeros(m, bool), None)
-    near = np.asarray(near, float)
+    near = frozen(near, None, "reference joint values")
     if near.shape not in ((n,), (m, n)):
         raise InputError("E-ARRAY-SHAPE", f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
     near = np.broadcast_to(near, (m, n)) / problem.unit
-    if not np.isfinite(near).all():
-        raise InputError("E-ARRAY-NOT-FINITE", "reference joint values: hold values that are not finite")
     return problem.searched(poses, *problem.from_near(poses, near), near)
 
 

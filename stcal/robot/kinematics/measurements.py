@@ -148,31 +148,28 @@ class Measurements(JointTable):
         found = {name: names == name for name in dict.fromkeys(self.stations)}
         return dict(sorted(found.items(), key=lambda item: -item[1].sum()))
 
+    def _held(self, values: np.ndarray | None, code: str, needed: str) -> np.ndarray:
+        if values is None:
+            raise InputError(code, f"{self.where}: {needed} needed")
+        return values
+
     def own_covariance(self) -> np.ndarray:
         """Returns the covariances (m, 6, 6) of the independent errors of poses, without the common ones."""
-        if self.covariance is None:
-            fault = f"{self.where}: poses without covariance"
-            raise InputError("E-MEASURED-NO-COVARIANCE", f"{fault}; columns of it needed")
-        return self.covariance if self.common is None else self.covariance - self.common @ self.common.swapaxes(1, 2)
+        every = self._held(self.covariance, "E-MEASURED-NO-COVARIANCE", "columns of the covariance")
+        return every if self.common is None else every - self.common @ self.common.swapaxes(1, 2)
 
     def points(self) -> np.ndarray:
         """Returns the measured positions (m, 3), mm."""
-        if self.positions is None:
-            raise InputError("E-MEASURED-DISTANCES", f"{self.where}: distances only; columns x_mm, y_mm, z_mm needed")
-        return self.positions
+        return self._held(self.positions, "E-MEASURED-DISTANCES", "positions, columns x_mm, y_mm, z_mm,")
 
     def poses(self) -> Poses:
         """Returns the measured poses world_from_tool."""
-        if self.rotations is None:
-            fault = f"{self.where}: positions without orientation"
-            raise InputError("E-MEASURED-NO-ORIENTATION", f"{fault}; {ORIENTED_BY} needed")
-        return Poses(self.rotations, self.points())
+        return Poses(self._held(self.rotations, "E-MEASURED-NO-ORIENTATION", ORIENTED_BY), self.points())
 
     def lengths(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the measured distances (m,), mm, and the rows (m,) at which they start."""
-        if self.distances is None or self.from_row is None:
-            raise InputError("E-MEASURED-KIND", f"{self.where}: positions, not distances; column distance_mm needed")
-        return self.distances, self.from_row
+        needed = "E-MEASURED-KIND", "distances, column distance_mm,"
+        return self._held(self.distances, *needed), self._held(self.from_row, *needed)
 
 
 def read_measurements(
@@ -282,24 +279,22 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
     if any(name.startswith(f"q{n + 1}_") for name in table.columns):
         fault = f"{table.where}: a column q{n + 1}_…, but robot {robot.name} has {n} joints"
         raise InputError("E-ROBOT-MISMATCH", f"{fault}; give its own file")
-    columns = []
-    for i, sliding in enumerate(robot.prismatic, 1):
-        units = LENGTHS if sliding else ANGLES
-        values = table.quantity(f"q{i}", units)
-        if not sliding and table.unit(f"q{i}", units) == "rad":
+    units = [LENGTHS if sliding else ANGLES for sliding in robot.prismatic]
+    q = np.column_stack([table.quantity(f"q{i}", units[i - 1]) for i in range(1, n + 1)])
+    in_rad = [not robot.prismatic[i] and table.unit(f"q{i + 1}", units[i]) == "rad" for i in range(n)]
+    many = in_rad & (np.abs(q) > 2 * np.pi * MOST_TURNS)
 
-            def turns(row: int, i: int = i, values: np.ndarray = values) -> str:
-                fault = f"q{i}_rad is {values[row]:g}, over {MOST_TURNS:g} turns"
-                return f"{fault}; if these are degrees call the column q{i}_deg"
+    def said(row: int) -> str:
+        name, value = f"q{many[row].argmax() + 1}", q[row, many[row].argmax()]
+        return f"{name}_rad is {value:g}, over {MOST_TURNS:g} turns; if these are degrees call the column {name}_deg"
 
-            table.refuse(np.abs(values) > 2 * np.pi * MOST_TURNS, "E-JOINT-VALUE", turns)
-        columns.append(values)
-    return np.column_stack(columns)
+    table.refuse(np.asarray(many.any(axis=1)), "E-JOINT-VALUE", said)
+    return q
 
 
 def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
     """Reads payload, by column ``payload_kg`` or the argument, and columns ``approach1`` …; raises InputError."""
-    mass, approach = loaded(payload_kg, len(table)).payload_kg, None
+    mass = loaded(payload_kg, len(table)).payload_kg
     if PAYLOAD in table:
         if payload_kg is not None:
             fault = f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}"
@@ -307,17 +302,19 @@ def read_conditions(table: Table, payload_kg: float | None = None, joints: int =
         mass = table.numbers(PAYLOAD)
         possible = (mass >= 0) & (mass <= MOST_KG)
         table.refuse(~possible, "E-PAYLOAD-VALUE", lambda i: f"{PAYLOAD} is {mass[i]:g}; 0 … {MOST_KG:g} needed")
-    for i, name in enumerate(approach_columns(joints)):
+    names, approach = approach_columns(joints), np.zeros((len(table), joints))
+    for i, name in enumerate(names):
         if name in table:
-            approach = np.zeros((len(table), joints)) if approach is None else approach
-            approach[:, i] = values = table.numbers(name)
-            came = f"1 (joint {i + 1} came from below), -1 (from above) or 0 (not known)"
-            table.refuse(
-                ~np.isin(values, DIRECTIONS),
-                "E-APPROACH-VALUE",
-                lambda k, name=name, values=values, came=came: f"{name} is {values[k]:g}; {came} needed",
-            )
-    return Conditions(mass, approach)
+            approach[:, i] = table.numbers(name)
+    wrong = ~np.isin(approach, DIRECTIONS)
+
+    def said(row: int) -> str:
+        at = int(wrong[row].argmax())
+        needed = "1 (the joint came from below), -1 (from above) or 0 (not known)"
+        return f"{names[at]} is {approach[row, at]:g}; {needed} needed"
+
+    table.refuse(np.asarray(wrong.any(axis=1)), "E-APPROACH-VALUE", said)
+    return Conditions(mass, approach if any(name in table for name in names) else None)
 
 
 def approach_columns(joints: int) -> list[str]:
@@ -386,22 +383,6 @@ class Targets(JointTable):
         require_fields(self, "targets")
         if self.q is not None:
             freeze(self, "q", (len(self), None), "joint values")
-
-    @classmethod
-    def from_poses(
-        cls, poses: Poses, q: ArrayLike | None = None, tools: Sequence[str] = (), where: str = "targets"
-    ) -> "Targets":
-        """Returns targets in memory.
-
-        ``poses`` : m poses base_from_tool, mm; ``q`` : (m, n) joint values near to which solutions are wanted, rad or
-        mm; ``tools`` : (m,) names, the only one if not given; ``where`` : their source, for messages. Raises
-        InputError: other numbers of joint values or tools.
-        """
-        m, values = len(poses), None if q is None else np.asarray(q, float)
-        names = tuple(tools) or ("",) * m
-        if len(names) != m or (values is not None and len(values) != m):
-            raise InputError("E-NAMES-COUNT", f"{where}: {m} poses, other numbers of joint values or tools; {m} needed")
-        return cls(where, range(1, m + 1), names, poses, values)
 
     def joints(self) -> np.ndarray:
         """Returns the commanded joint values (m, n), rad or mm. Raises an error if there are none."""

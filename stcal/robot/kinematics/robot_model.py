@@ -299,11 +299,6 @@ class Robot(Brief):
 
     def __post_init__(self):
         where = f"robot {self.name}"
-        for kind, parts in ((DHRow, self.rows), (Joint, self.joints)):
-            for part in parts if isinstance(parts, Sequence) else (parts,):
-                if not isinstance(part, kind):
-                    fault = f"{where}: {part!r} is no {kind.__name__}"
-                    raise InputError("E-ROBOT-ENTRIES", f"{fault}; one of that type needed")
         require_fields(self, where)
         n, joints = len(self.rows), len(self.joints)
         if joints != n or n == 0:

@@ -79,33 +79,44 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     """Returns whether joint values beside the poses confirm them, and doubts about the poses of ``robot``.
 
-    Raises InputError: joint values lead to the poses in another unit, convention or order of rows, which it names.
+    Raises InputError: joint values lead to the poses in another unit, convention or order of rows, which it names;
+    chance does so once in 10⁶ a row.
     """
-    if targets.poses is None:
+    poses, q = targets.poses, targets.q
+    if poses is None:
         return True, ()
-    if targets.q is None:
-        return False, _near_base(robot, targets, targets.poses)
-    reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot, set(targets.tools))
-    own = rms(position_errors(reached.translation - targets.poses.translation))
-    if own <= FITS * reach:
-        require_orientations(targets.where, targets.tools, reached.rotation, targets.poses.rotation, many=False)
-    else:
-        _explain(robot, targets, targets.poses, targets.q, own, reach)
-    notes = _elsewhere(targets, targets.poses.difference(reached), reach)
-    return not notes, notes + (_near_base(robot, targets, targets.poses) if notes else ())
+    near_base = _near_base(robot, targets, poses)
+    if q is None:
+        return False, near_base
 
-
-def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
-    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row."""
+    def off(case: tuple[Poses, np.ndarray]) -> np.ndarray:
+        """Returns the length (2, m) of the turn, rad, and of the shift, mm, from where joint values lead to poses."""
+        return np.linalg.norm(case[0].difference(poses_of(robot, targets, case[1])).reshape(-1, 2, 3), axis=2).T
 
     def misfit(case: tuple[Poses, np.ndarray]) -> float:
-        off = case[0].difference(poses_of(robot, targets, case[1]))
-        return np.inf if rms(np.linalg.norm(off[:, :3], axis=1)) >= TURNED_RAD else rms(position_errors(off))
+        turn, shift = map(rms, off(case))
+        return np.inf if turn >= TURNED_RAD else shift
 
-    for best, left in explain(_mistakes(robot, poses, q), misfit, min(FITS * reach, EXPLAINS * own))[:1]:
-        away = f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses"
-        fault = f"{away}, {FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach"
-        raise InputError("E-ROBOT-MISMATCH", f"{fault}; but {left:.3g} mm if {best.words}")
+    (rad, mm), allowed = off((poses, q)), FITS * reach_mm(robot, set(targets.tools))
+    own = rms(mm)
+    if own <= allowed:
+        reached = poses_of(robot, targets, q).rotation
+        require_orientations(targets.where, targets.tools, reached, poses.rotation, many=False)
+    else:
+        for best, left in explain(_mistakes(robot, poses, q), misfit, min(allowed, EXPLAINS * own))[:1]:
+            away = f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses"
+            fault = f"{away}, {allowed:.3g} mm allowed, {FITS:.0%} of the reach"
+            raise InputError("E-ROBOT-MISMATCH", f"{fault}; but {left:.3g} mm if {best.words}")
+    away = (mm > allowed) | (rad > TURNED_RAD)
+    if not away.any() or (len(q) > 1 and not np.ptp(q, axis=0).any()):  # the same values only choose a branch
+        return True, ()
+    note = (
+        f"joint values of {away.sum()} of {len(q)} rows, first line {targets.lines[int(away.argmax())]}, lead "
+        f"elsewhere than their poses, by {np.median(mm[away]):.4g} mm and {np.degrees(np.median(rad[away])):.3g}° "
+        "(median): they only choose the branch; if they are those of the poses, check order, units and conventions; if "
+        "the poses are of the nominal robot's tool, give that robot with --nominal"
+    )
+    return False, (note, *near_base)
 
 
 def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
@@ -120,20 +131,6 @@ def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
     yield Candidate(inverse, lambda: (poses.inverse(), q))
     radians = "joint values were radians in columns of degrees; call the columns q1_rad …"
     yield Candidate(radians, lambda: (poses, q * robot.shown))  # degrees in columns of radians: told where read
-
-
-def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
-    """Returns a note on joint values that miss poses by (m, 6), unless they only choose a branch."""
-    mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
-    away = (mm > FITS * reach) | (rad > TURNED_RAD)
-    if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):
-        return ()
-    return (
-        f"joint values of {away.sum()} of {len(off)} rows, first line {targets.lines[int(away.argmax())]}, lead "
-        f"elsewhere than their poses, by {np.median(mm[away]):.4g} mm and {np.degrees(np.median(rad[away])):.3g}° "
-        "(median): they only choose the branch; if they are those of the poses, check order, units and conventions; if "
-        "the poses are of the nominal robot's tool, give that robot with --nominal",
-    )
 
 
 def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
@@ -273,7 +270,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     to be one; an unknown tool; poses to which their joint values lead in another unit or convention only.
     """
     if isinstance(targets, Poses):
-        targets = Targets.from_poses(targets)
+        m = len(targets)
+        targets = Targets("targets", range(1, m + 1), ("",) * m, targets, None)
     both = [identified] if nominal is None else [identified, nominal]
     builds = [[(joint.type, each.tree.after(i)) for i, joint in enumerate(each.joints)] for each in both]
     if builds[0] != builds[-1]:

@@ -15,11 +15,11 @@ from pydantic import Field
 from scipy.special import stdtr
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, freeze, require_arguments
+from stcal.geometry.arrays import freeze, require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.io.json import Named, Part, ResultFile, Texts, Vector
-from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.io.json import Named, Part, ResultFile, Vector
+from stcal.io.table import Table, read_table
 from stcal.robot.descriptions import few
 from stcal.robot.identification.adjustment import (
     WIDTH,
@@ -43,17 +43,18 @@ SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
 """Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
-OFF, OFF_MM = 6.0, 0.1  # ratio of a pose's typical error to that of most, and its size, from which on the pose is named
+OFF, OFF_MM, LEAST_POSES = 6.0, 0.1, 6
+"""Ratio of a pose's typical error to that of most, and its size, from which on the pose is named; and least number of
+poses for it."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
-NO_BETTER, WORSE = 0.8, 1.2  # times the errors of the first set: about as much, and more
+NO_BETTER = 0.8  # ratio to the errors of the first set from which on they are about as large
 MOST_OF_IT = 0.75  # share of the squared errors of distances from which on their scale is named
 LEAST_SPREAD_MM = 20.0  # largest commanded distance below which the unit is doubted
-EXCHANGED = "were the sets exchanged? The one before compensation comes first"
 NOT_COMPENSATED = (
-    "were these positions commanded with compensated joint values, and was --robot of compensate the file of identify?"
+    "is the first set in the file the one before compensation, and were the others commanded with compensated joint "
+    "values, --robot of compensate being the file of identify?"
 )
-SCALE_WITHIN = 0.005  # largest relative difference of scale; more is another unit, or other poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,17 +91,14 @@ class SetResult(Part):
 
     def doubt(self) -> str:
         """Returns why the measured positions may not belong to the commands; empty if they may."""
-        allowed, off, said = max(MISSES * self.pairs_mm, MISSES_MM), abs(self.scale - 1), self.elsewhere
-        if not said and off > SCALE_WITHIN:
-            remedy = "check the instrument's scale" if off < MISSES else "check units and the order of the poses"
-            for unit, words in UNIT_WORDS.items():
-                for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
-                    if abs(self.scale / times - 1) < SCALE_WITHIN:
-                        remedy = f"check units, as if the {side} ones were {words}"
-            said = f"measured distances are {self.scale:.4g} times the commanded ones; {remedy}"
+        allowed, said = max(MISSES * self.pairs_mm, MISSES_MM), self.elsewhere
+        by_scale = (self.scale - 1) * self.pairs_mm
+        if not said and by_scale**2 > MOST_OF_IT * self.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2:
+            times = f"measured distances are {self.scale:.6g} times the commanded ones, which is most of their error"
+            said = f"{times}: check units, and the instrument's scale"
         elif not said and self.pairs_rms_mm > allowed:
             missed = f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs)"
-            remedy = "check the order of the poses, and the robot that commanded them"
+            remedy = "check the order of the poses, units, and the robot that commanded them"
             said = f"{missed}, {allowed:.3g} mm allowed; {remedy}"
         return said and f"set {self.name}: {said}"
 
@@ -109,8 +107,8 @@ class SetResult(Part):
         return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
 
 
-class VerificationFile(ResultFile):
-    """Result file of ``verify``."""
+class Verification(ResultFile):
+    """Distance errors of several sets of measurements, over the poses that all sets have: result file of ``verify``."""
 
     format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
     poses: list[str] = Field(description="names, the first being the one that distances start from")
@@ -121,54 +119,34 @@ class VerificationFile(ResultFile):
         "measured over commanded ones; `elsewhere`: poses that alone are not where they were commanded"
     )
     missing: dict[Annotated[str, "set"], list[str]] = Field(description="poses that a set lacks")
-    warnings: Texts = Field(description="what to look at")
+    warnings: list[str] = Field(description="what to look at")
     notes: list[str] = Field(description="columns that were not read")
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Verification(Brief):
-    """Distance errors of several sets of measurements, over the poses that all sets have.
-
-    ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :
-    by set, the poses that it lacks; they are left out of all sets; ``notes`` : on columns that were not read.
-    """
-
-    format: ClassVar = "stcal verification 1"
-    where: str
-    poses: tuple[str, ...]
-    distance_mm: np.ndarray
-    sets: tuple[SetResult, ...]
-    missing: dict[str, tuple[str, ...]]
-    notes: tuple[str, ...] = ()
 
     def reduction(self, index: int) -> dict[str, float]:
         """Returns the reduction of each figure of set ``index`` relative to the first set, per cent."""
         first, figures = self.sets[0].figures(), self.sets[index].figures()
         return {key: 100 * (1 - figures[key] / value) if value > 0 else float("nan") for key, value in first.items()}
 
-    def warnings(self) -> list[str]:
-        """Returns warnings of missing poses and of doubtful sets."""
-        found = [
-            f"set {name}: missing poses, left out of all sets ({len(poses)}): {few(poses)}"
-            for name, poses in self.missing.items()
-            if poses
-        ]
-        found += [doubt for each in self.sets if (doubt := each.doubt())]
-        if (most := float(self.distance_mm.max())) < LEAST_SPREAD_MM:
-            remedy = "if lengths are in another unit than the names of their columns say, correct these"
-            found.append(f"commanded positions lie within {most:.3g} mm of the first one; {remedy}")
-        first = self.sets[0]
-        for each in (each for each in self.sets if not each.doubt()):
-            by_scale, ratio = abs(each.scale - 1) * each.pairs_mm, each.pairs_rms_mm / max(first.pairs_rms_mm, 1e-12)
-            against = f"{each.pairs_rms_mm:.3g} against {first.pairs_rms_mm:.3g} mm (RMS of all pairs)"
-            if by_scale**2 > MOST_OF_IT * each.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2:
-                times = f"measured distances are {each.scale:.5f} times the commanded ones"
-                found.append(f"set {each.name}: {times}, which is most of its error: check the instrument's scale")
-            if each is not first and ratio > NO_BETTER:
-                worse = f"errs more than set {first.name}, the first in the file, {against}: {EXCHANGED}"
-                alike = f"errs as set {first.name} does, {against}: {NOT_COMPENSATED}"
-                found.append(f"set {each.name}: {worse if ratio > WORSE else alike}")
-        return found
+
+def _warnings(sets: list[SetResult], missing: dict[str, list[str]], most_mm: float) -> list[str]:
+    """Returns warnings of missing poses and of doubtful sets; ``most_mm`` : the longest commanded distance."""
+    found = [
+        f"set {name}: missing poses, left out of all sets ({len(poses)}): {few(poses)}"
+        for name, poses in missing.items()
+        if poses
+    ]
+    found += [doubt for each in sets if (doubt := each.doubt())]
+    if most_mm < LEAST_SPREAD_MM:
+        remedy = "if lengths are in another unit than the names of their columns say, correct these"
+        found.append(f"commanded positions lie within {most_mm:.3g} mm of the first one; {remedy}")
+    first = sets[0]
+    found += [
+        f"set {each.name}: errs by {each.pairs_rms_mm:.3g} mm (RMS of all pairs), no less than set {first.name} with "
+        f"{first.pairs_rms_mm:.3g} mm: {NOT_COMPENSATED}"
+        for each in sets[1:]
+        if not each.doubt() and each.pairs_rms_mm > NO_BETTER * max(first.pairs_rms_mm, 1e-12)
+    ]
+    return found
 
 
 def read_measured(path: str | Path | Table) -> MeasuredPoses:
@@ -213,7 +191,7 @@ def verify(data: MeasuredPoses) -> Verification:
     for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
         rows.setdefault(group, {})[name] = i
     every = dict.fromkeys(data.names)
-    missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
+    missing = {group: [name for name in every if name not in own] for group, own in rows.items()}
     common = [name for name in every if not any(name in lacking for lacking in missing.values())]
     if len(common) < 3:
         which = f"{'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}"
@@ -232,29 +210,32 @@ def verify(data: MeasuredPoses) -> Verification:
         copied = group != first and (data.measured[own] == data.measured[at]).all()
         sets.append(_set_result(data, group, own, common, COPIED if copied else ""))
     distances = np.linalg.norm(data.commanded[at[1:]] - data.commanded[at[0]], axis=1)
-    return Verification(data.where, tuple(common), distances, tuple(sets), missing, data.notes)
+    return Verification(
+        format="stcal verification 1",
+        poses=common,
+        distance_mm=distances,
+        sets=sets,
+        missing=missing,
+        warnings=_warnings(sets, missing, float(distances.max())),
+        notes=list(data.notes),
+    )
 
 
 COPIED = "measured positions are those of the first set to the last digit; give those of the instrument"
 
 
 def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
-    """Returns which few poses (n, 3) miss most others by more than allowed, while these fit one another; else ""."""
+    """Returns which few poses (n, 3) miss most others by far more than these miss one another; else ""."""
     if (measured == commanded).all():
         return "measured positions are the commanded ones to the last digit; give those of the instrument"
     wanted, found = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, measured))
-    missed = np.abs(found - wanted)
-    typical = np.median(missed, axis=1)
-    off = typical > max(MISSES * np.median(wanted), MISSES_MM)
+    typical = np.median(np.abs(found - wanted), axis=1)
     far = typical > max(OFF * np.median(typical), OFF_MM)
-    if not off.any() and len(names) >= 6 and 0 < far.mean() <= MOST_ELSEWHERE:
-        listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far).tolist())
-        most = f"{np.median(typical):.2g} mm"
-        return f"pose{'s' * int(far.sum() > 1)} {listed}: far worse than the others, {most} (median); measure again"
-    if not off.any() or off.mean() > MOST_ELSEWHERE or missed[np.ix_(~off, ~off)].max() > MISSES_MM:
+    if len(names) < LEAST_POSES or not 0 < far.mean() <= MOST_ELSEWHERE:
         return ""
-    listed = few([name for name, wrong in zip(names, off, strict=True) if wrong])
-    return f"pose{'s' * int(off.sum() > 1)} {listed}: not where commanded, the others are; correct or remove"
+    listed = few([f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far).tolist()])
+    others = f"far worse than the others, {np.median(typical):.2g} mm (median)"
+    return f"pose{'s' * int(far.sum() > 1)} {listed}: {others}: correct the rows, or measure again"
 
 
 def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str], elsewhere: str) -> SetResult:

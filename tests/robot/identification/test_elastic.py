@@ -220,7 +220,7 @@ def test_files_say_what_was_carried_and_from_where_joints_came(tmp_path):
     for cells, message in (
         ("-1,1", "E-PAYLOAD-VALUE … line 3 … payload_kg … -1 … 10000"),
         ("nan,1", "E-TABLE-NUMBER … payload_kg … 'nan'"),
-        ("60,2", "E-APPROACH-VALUE … 3 … approach2 … 2 … 2"),
+        ("60,2", "E-APPROACH-VALUE … 3 … approach2 … 2"),
         ("60,nan", "E-TABLE-NUMBER … approach2 … 'nan'"),
     ):
         path.write_text(f"{text}{cells}\n")

@@ -208,7 +208,7 @@ def test_rokae_held_out(rokae):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"sigma_mm": 5e-5}, "outliers by the σ that are stated"),
+        ({"sigma_mm": 5e-5}, "times the σ that are stated"),
         ({"sigma_mm": 50.0, "sigma_rad": 2e-4}, "residuals of positions are 0.0"),
         ({"sigma_rad": 0.0115}, "residuals of orientations are 0.0"),
         ({"sigma_mm": 0.05, "sigma_rad": 2e-4}, ""),

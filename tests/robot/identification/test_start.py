@@ -60,7 +60,6 @@ def turned(*quarters):
 
 
 WITH_ZERO = turned(0, 0, 0, -1, 0, 0)
-EXCHANGED = replace(mh80(), rows=tuple(mh80().rows[i] for i in (0, 2, 1, 3, 4, 5)))
 
 
 def as_it_is(q: np.ndarray) -> np.ndarray:
@@ -75,16 +74,14 @@ def as_it_is(q: np.ndarray) -> np.ndarray:
             [
                 (replace(mh80(), convention="modified"), as_it_is, [], "standard convention"),
                 (WITH_ZERO, as_it_is, [3, 20], "theta of joint 4 … +90° … lines 5, 22 were not there"),
-                (EXCHANGED, as_it_is, [3, 20], "rows 2 and 3 were exchanged … lines 5, 22 were not there"),
                 # joint 1 is square to joint 2: half a turn of the one's zero is the opposite sign of the other
                 (turned(0, 0, 0, 2, 0, 0), as_it_is, [], "or if"),
                 (mh80(), lambda q: q[:, [0, 2, 1, 3, 4, 5]], [], "columns q2 and q3 were exchanged"),
-                (mh80(), lambda q: q[:, ::-1], [], "opposite order"),
                 (mh80(), lambda q: np.roll(q, 1, axis=0), [], "one row further up"),
                 (mh80(), lambda q: np.roll(q, -1, axis=0), [], "one row further down"),
                 (mh80(), lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by +1"),
             ],
-            kept=(1, 2, 3, 4, 6),
+            kept=(1, 2, 4),
         ),
     ],
 )
@@ -95,40 +92,21 @@ def test_mistakes_are_named(mistaken, change, wrong, named):
     refuses(f"E-IDENTIFY-MISFIT … {named}", start, mistaken, replace(data, q=change(data.q), positions=positions))
 
 
-@pytest.mark.parametrize("way", ["exchanged", "sign", "line", "random"])
-def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(way):
-    """Misreadings that no quaternion convention explains are named; what none explains is refused, too."""
+def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit():
     rng = np.random.default_rng(4)
     robot = mh80()
     data = measured(robot, joint_vectors(robot, 30, rng), rng)
-    angles = Rotation.from_matrix(data.rotations).as_euler("xyz")
-    rotations, said = {
-        "exchanged": (Rotation.from_euler("xyz", angles[:, ::-1]), "the first and the third angle were exchanged"),
-        "sign": (Rotation.from_euler("xyz", angles * [1, -1, 1]), "the angle about Y had the other sign"),
-        "line": (Rotation.from_matrix(np.roll(data.rotations, 1, axis=0)), "each orientation were in the line before"),
-        "random": (Rotation.random(30, rng), "check the convention of the angles"),
-    }[way]
+    rotations, said = Rotation.random(30, rng), "check the convention of the angles"
     refuses(f"E-ROBOT-ORIENTATIONS … {said}", start, robot, replace(data, rotations=rotations.as_matrix()))
     third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
     start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
 
 
-@pytest.mark.parametrize(
-    ("starts", "named"),
-    [
-        ((), "20 rows, from line 22 to 41, did not repeat the position"),
-        ((12, 27), "the instrument, or the robot's base, had not moved before lines 14, 29 … column station"),
-    ],
-)
-def test_rows_that_repeat_a_position_and_an_instrument_that_moved_far_are_named(starts, named):
-    """An instrument that moved, while the target stays, is mended by column station."""
+def test_an_instrument_that_moved_far_is_refused_with_the_column_that_mends_it():
     data = replace(seen(2, 40), rotations=None)
     positions = data.positions.copy()
-    for k, row in enumerate(starts):
-        positions[row:] = Rigid.exp([0.3, -0.2, 1.0 + k, 1500, -900, 400]) @ positions[row:]
-    if not starts:
-        positions[20:] = positions[19]
-    refuses(f"E-IDENTIFY-MISFIT … {named}", start, mh80(), replace(data, positions=positions))
+    positions[12:] = Rigid.exp([0.3, -0.2, 1.0, 1500, -900, 400]) @ positions[12:]
+    refuses("E-IDENTIFY-MISFIT … moved … column station or target", start, mh80(), replace(data, positions=positions))
 
 
 def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():

@@ -116,7 +116,7 @@ def test_joints_are_drawn_with_the_rows_that_they_move_and_a_target_on_no_branch
     robot, rng = two_arms(), np.random.default_rng(3)
     seen = observed(seen_by(robot, rng, each=4))
     state = State(robot.chain(), dict(robot.tools))
-    drawn = joints_figure(state, seen, state.residuals(seen), np.ones(12, bool), ())
+    drawn = joints_figure(state, seen, state.residuals(seen), np.ones(12, bool))
     dots = re.findall(r'd="([^"]*)" stroke="[^"]*" stroke-opacity', drawn.svg())
     points = [path.count("M") for path in dots]
     assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
