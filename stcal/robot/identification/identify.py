@@ -280,10 +280,9 @@ def _observability(robot: Robot, solution: ArmSolution, rank: int) -> Observabil
     if measured.frameless:  # remove what a motion of all points of a station can produce
         points, stations = measured.data.points(), measured.data.by_station().values()
         moves = [frame_motions(points, points[own].mean(0))[:, 3:] * own[:, None, None] for own in stations]
-        motions = np.concatenate(moves, axis=2)
-        u, s, _ = np.linalg.svd(weighting.whiten(motions, measured).reshape(-1, motions.shape[2]), full_matrices=False)
-        u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
-        rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
+        motions = weighting.whiten(np.concatenate(moves, axis=2), measured).reshape(rows.shape[0] * rows.shape[1], -1)
+        flat = rows.reshape(len(motions), -1)
+        rows = (flat - motions @ np.linalg.lstsq(motions, flat, rcond=1e-9)[0]).reshape(rows.shape)
     return ObservabilityIndices.of_jacobian(rows, rank)
 
 
