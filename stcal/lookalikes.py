@@ -23,12 +23,6 @@ class Likeness:
     gap_mm: float  # largest distance of two centres, at the size of the other pattern
     turn_rad: float  # −π … π
     scale: float  # the other pattern's size over the pattern's own
-    shift_mm: tuple[float, float]  # after rotation and scale
-
-    def moved(self, xy: np.ndarray) -> np.ndarray:
-        """Returns a point (2,) of the pattern, moved onto the other pattern."""
-        c, s = self.scale * np.cos(self.turn_rad), self.scale * np.sin(self.turn_rad)
-        return np.array([[c, -s], [s, c]]) @ xy + self.shift_mm
 
 
 @kept
@@ -66,8 +60,7 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
         gap = abs(change * centred - target)
         coincides = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
         if coincides.all() and alike(scale * radius, other_radius).all():
-            shift = other.mean() - change * own.mean()
-            return Likeness(float(gap.max()), float(np.angle(change)), scale, (shift.real, shift.imag))
+            return Likeness(float(gap.max()), float(np.angle(change)), scale)
     return None
 
 
