@@ -4,7 +4,6 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +83,8 @@ MAX_REPROJECTION_PX = 4.0  # largest reprojection error of an observation in the
 MIN_AGREEMENT = 0.5  # share of the circles seen at least twice that a model must contain
 LOG_ERRORS_ONLY = 3
 SHOW_BOTH = "photograph faces and board together"
+BY_PAIR = "the relative pose of the chosen pair"
+BY_BOARD = f"{BY_PAIR}, by the board (a plane has two essential matrices)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,28 +100,18 @@ class Mapping:
 
 def map_group(
     database: Path,
-    scratch: Path,
     group: list[ImageObservations],
     skeleton: Collection[str],
     ids: dict[str, int],
     pairs: list[PairScore],
     camera: Camera,
 ) -> Mapping:
-    """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
-    If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
+    """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair and its pose in the ranking, the other images
+    are resected by their labels."""
     names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
-    seed = ids[pair.first], ids[pair.second]
     assert pair.second_from_first is not None, "chosen pairs have a pose"
-    own = partial(_own_mapping, database, names, seed, pair.second_from_first)
-    ways = {
-        "COLMAP's estimate of the chosen pair": partial(seeded_mapping, database, scratch, names, seed),
-        "our relative pose of the chosen pair (COLMAP's gates refused its own)": own,
-    }
-    if share_board_alone(*(i for i in group if i.name in (pair.first, pair.second))):
-        ways = {"our relative pose of the chosen pair, by the board (a plane has two essential matrices)": own} | ways
     try:
-        found = ((seeded, model) for seeded, way in ways.items() if (model := way()) is not None)
-        seeded, reconstruction = next(found, ("", None))
+        reconstruction = _mapped(database, names, (ids[pair.first], ids[pair.second]), pair.second_from_first)
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise
@@ -137,7 +128,8 @@ def map_group(
         fault = f"group {model.group}: {agree}, {MIN_AGREEMENT * wanted:.0f} needed"
         remedy = "check that the camera file belongs to the images, and that nothing but the camera moved"
         raise MappingError("E-MAPPING-DISAGREE", f"{fault}; {remedy}")
-    return Mapping(model, outliers, left_out(group, model), seeded, SHOW_BOTH)
+    by_board = share_board_alone(*(i for i in group if i.name in (pair.first, pair.second)))
+    return Mapping(model, outliers, left_out(group, model), BY_BOARD if by_board else BY_PAIR, SHOW_BOTH)
 
 
 def left_out(group: Sequence[ImageObservations], model: WorldModel, remedy: str = SHOW_BOTH) -> dict[str, str]:
@@ -193,7 +185,7 @@ def seeded_mapping(
     return best if best is not None and best.num_reg_images() >= 2 else None
 
 
-def _own_mapping(
+def _mapped(
     database: Path, names: list[str], pair: tuple[int, int], second_from_first: Rigid
 ) -> pycolmap.Reconstruction | None:
     """Runs COLMAP's incremental mapper step by step, starting from the relative pose of the pair (ids)."""

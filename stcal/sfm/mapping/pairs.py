@@ -181,7 +181,6 @@ SPARSE_FROM = 80
 MIN_SHARED = 6  # smallest number of common labels of a pair of images that is written
 SKELETON = 20  # number of images of a group that are mapped first. Smaller groups are mapped as a whole.
 MIN_VIEWS = 3  # smallest number of views of every circle in the skeleton, if the group has that many
-NEIGHBOURS = 3  # smallest number of skeleton images that each image outside the skeleton is paired with
 MIN_DOTS = 6
 
 
@@ -207,11 +206,9 @@ def image_graph(
     skeleton, joined = {}, np.zeros(shared.shape, bool)
     for name, indices in members.items():
         direction = np.array([_direction(observations[i], board) for i in indices])
-        chosen = _skeleton(direction, sees[indices])
-        skeleton[name] = indices[chosen]
-        among = np.ix_(indices[chosen], indices[chosen])
+        skeleton[name] = indices[_skeleton(direction, sees[indices])]
+        among = np.ix_(skeleton[name], skeleton[name])
         joined[among] = shared[among] >= MIN_SHARED
-        _join_neighbours(joined, indices, chosen, direction, sees, shared)
     _join_tracks(joined, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
     return ImageGraph(kind, np.argwhere(np.triu(joined, 1)), skeleton)
 
@@ -259,22 +256,6 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
         gain[chosen] = 0
         chosen.append(int(np.argmax(gain)))
     return np.sort(chosen)
-
-
-def _join_neighbours(joined: np.ndarray, indices, chosen, direction, seen, shared) -> None:
-    """Joins the group's other images with skeleton images: the nearest, and those their circles need."""
-    skeleton = indices[chosen]
-    for k in np.setdiff1d(np.arange(len(indices)), chosen):
-        i = indices[k]
-        near = np.nan_to_num(direction[chosen] @ direction[k], nan=-1.0)
-        order = skeleton[np.argsort(-near, kind="stable")]
-        order = order[shared[i, order] >= MIN_SHARED]
-        picked = list(order[:NEIGHBOURS])
-        open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
-        while open_labels.any():
-            picked.append(max(order, key=lambda j: int((seen[j] & open_labels).sum())))
-            open_labels &= ~seen[picked[-1]]
-        joined[i, picked] = joined[picked, i] = True
 
 
 def _join_tracks(joined: np.ndarray, seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:

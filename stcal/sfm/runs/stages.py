@@ -395,7 +395,7 @@ def _solve_groups(task: Task, groups: Groups, names: Collection[str]) -> tuple[d
     scratch = task.folder.stage / "scratch"
     scratch.mkdir()
     try:
-        jobs = [(inputs[name], scratch / str(k)) for k, name in enumerate(pending)]
+        jobs = [(inputs[name], scratch / f"{k}.db") for k, name in enumerate(pending)]
         for name, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[name] = solution
             if isinstance(solution, GroupSolution):
@@ -413,16 +413,14 @@ def _solve_groups(task: Task, groups: Groups, names: Collection[str]) -> tuple[d
     return _each_group(inputs, with_scale)
 
 
-def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
-    """Solves one group with a database of its own in a folder that is made; returns why it has no solution."""
+def _solved(group: _Group, database: Path) -> GroupSolution | StcalError:
+    """Solves one group with a database of its own, which is written; returns why it has no solution."""
     images, camera, board = group.images, group.camera, group.board
-    scratch.mkdir()
-    ids, database = image_ids(images), scratch / "mapping.db"
     try:
         first = [image for image in images if image.name in group.skeleton]
         pairs = rank_pairs(first, camera, group.pair_options, board)
         write_database(database, camera, images, group.matched)
-        mapping = map_group(database, scratch / "models", images, group.skeleton, ids, pairs, camera)
+        mapping = map_group(database, images, group.skeleton, image_ids(images), pairs, camera)
         refined = refine_or_explain(mapping.model, camera, group.target, board, group.eccentricity)
     except UNSOLVED as error:
         return error

@@ -79,7 +79,7 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_pa
     group = [o for o in observations if o.group == "12"]
     pairs = rank_pairs(group, result.camera, PairOptions())
     own = own_copy(result.out / "colmap/database.db", tmp_path)  # pycolmap changes what it opens
-    mapping = map_group(own, tmp_path / "scratch", group, list(ids), ids, pairs, result.camera)
+    mapping = map_group(own, group, list(ids), ids, pairs, result.camera)
     ours = next(s.model for s in result.solutions if s.model.group == "12")
     with pycolmap.Database.open(str(own)) as database:
         keypoints = {o.name: from_colmap_px(database.read_keypoints(ids[o.name])[:, :2]) for o in group}
