@@ -126,7 +126,6 @@ CALLS = (
     Call("sfm report", "~run --pdf", 5.0),
     Call("sfm report", "@run --out >page.html", 3.0),
     Call("sfm export-database", "@run +copy.db --schema 3.8"),
-    Call("sfm export-database", "@run +copy.db --schema 4.2"),
     *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt")),
     *(Call("sfm export", f"@run +box.{suffix} --name box") for suffix in ("urdf", "xacro", "yaml", "yml", "csv")),
     Call("sfm export", "@run +box.txt --form ros2"),

@@ -227,9 +227,9 @@ def _warn_of_failures(run: Path) -> None:
 def export_database(
     run: Run,
     out: Annotated[Path, "Write the copy to this file, which must be new.", Arg("OUT.db", writes=True)],
-    schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."],
+    schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.1, 4.2."],
 ) -> None:
-    """Copy the run's database in the form of another version of COLMAP; ids, orders and values stay the same."""
+    """Copy the run's database in the form of COLMAP 3.8, which later versions open; ids and values stay the same."""
     from stcal.sfm.interop.export_colmap import database_text
     from stcal.sfm.interop.export_colmap import export_database as export
 

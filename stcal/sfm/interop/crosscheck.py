@@ -28,7 +28,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces_file import FacesFile
 from stcal.sfm.adjust.refine import free_network, refine
 from stcal.sfm.data.group_model import WorldModel
-from stcal.sfm.interop.export_colmap import find_schema, schema_of_version, write_copy
+from stcal.sfm.interop.export_colmap import FORM, require_version, write_copy
 from stcal.sfm.mapping.database import image_ids, pycolmap
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
 from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
@@ -289,12 +289,12 @@ def _compared(
     run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress
 ) -> Crosscheck:
     native = find_colmap(colmap)
-    schema = schema_of_version(native.version)
+    require_version(native.version)
     ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
     native_models, own_models, adjusted = [], [], []
     with scratch_folder("crosscheck") as folder:
-        write_copy(run, folder / "native.db", schema)
-        write_copy(run, folder / "ours.db", find_schema("4.2"))
+        write_copy(run, folder / "native.db")
+        shutil.copy(folder / "native.db", folder / "ours.db")
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names, work = [image.name for image in group], folder / f"group{index}"
@@ -330,7 +330,7 @@ def _compared(
     check = Crosscheck(
         native=native.version,
         pycolmap=pycolmap.__version__,
-        schema=schema.name,
+        schema=FORM,
         tolerances=tolerances if run.faces.target_from_face_covariance else tolerances.without_sigma(),
         notes=list(of_native.notes),
         differences=[],

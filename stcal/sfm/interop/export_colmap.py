@@ -1,12 +1,11 @@
-"""Export to COLMAP and viewers of its models: the database in the schema of any version, and the final model.
+"""Export to COLMAP and viewers of its models: the database, and the final model.
 
-The schemas of the database, as SQL, were read from the empty database that each version itself makes: 3.8 from the
-native program, 3.9 (3.9.1) to 4.2 (4.2.1) from pycolmap. Releases of one version differ in nothing but the last digits
-of ``user_version``, which 4.x stamps as major, minor and patch. The tables of 4.1 are those of 4.0.
+The database has the form that COLMAP 3.8 itself makes, the oldest. All later versions open it, bring it to their own
+form, and make the same model of it to the last digit as of one in their own form (pycolmap of 3.9.1, 3.10.0, 3.11.1,
+3.12.6, 3.13.0, 4.0.4, 4.1.1 and 4.2.1).
 """
 
 import os
-import re
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -27,101 +26,33 @@ from stcal.sfm.mapping.models import open_model, require_keypoints, write_recons
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
-
-@dataclass(frozen=True, slots=True)
-class Schema:
-    name: str
-    user_version: int  # the stamp of the version's first release
-    tables: dict[str, str]  # declaration by name
-    indices: dict[str, str]  # table and columns of unique indices by name
-
-
+VERSIONS = ("3.8", "3.9", "3.10", "3.11", "3.12", "3.13", "4.0", "4.1", "4.2")
+"""Versions of COLMAP that open an exported database."""
+FORM, USER_VERSION = VERSIONS[0], 3800  # version whose form it has, and the stamp of that
 _MATRIX = "rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
-_IMAGE_KEY = "image_id INTEGER NOT NULL PRIMARY KEY"
 _OF_IMAGE = "FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE"
-_OF_RIG = "FOREIGN KEY (rig_id) REFERENCES rigs (rig_id) ON DELETE CASCADE"
-_SENSOR = "sensor_id INTEGER NOT NULL, sensor_type INTEGER NOT NULL"
+_ARRAY = f"image_id INTEGER NOT NULL PRIMARY KEY, {_MATRIX}, {_OF_IMAGE}"
 _PAIRS = f"pair_id INTEGER NOT NULL PRIMARY KEY, {_MATRIX}"
-_GEOMETRIES = f"{_PAIRS}, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB"
-_IMAGES = (
-    "image_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, camera_id INTEGER NOT NULL{}, "
+TABLES = {
+    "cameras": "camera_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, model INTEGER NOT NULL, width INTEGER NOT NULL, "
+    "height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL",
+    "images": "image_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL, camera_id INTEGER NOT NULL, "
+    "prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL, prior_tx REAL, prior_ty REAL, prior_tz REAL, "
     "UNIQUE (name), CHECK (image_id >= 0 and image_id < 2147483647), "
-    "FOREIGN KEY (camera_id) REFERENCES cameras (camera_id)"
-)
-_PRIOR_POSES = "".join(f", prior_{name} REAL" for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz"))
-_PRIORS = f"{_IMAGE_KEY}, position BLOB, coordinate_system INTEGER NOT NULL"
-
-_CHANGES: dict[str, tuple[int, dict[str, str], dict[str, str]]] = {
-    "3.8": (
-        3800,
-        {
-            "cameras": "camera_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, model INTEGER NOT NULL, "
-            "width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL",
-            "images": _IMAGES.format(_PRIOR_POSES),
-            "keypoints": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
-            "descriptors": f"{_IMAGE_KEY}, {_MATRIX}, {_OF_IMAGE}",
-            "matches": _PAIRS,
-            "two_view_geometries": _GEOMETRIES,
-        },
-        {"index_name": "images (name)"},
-    ),
-    "3.9": (3900, {}, {}),
-    "3.10": (3900, {"images": _IMAGES.format(""), "pose_priors": f"{_PRIORS}, {_OF_IMAGE}"}, {}),
-    "3.11": (3900, {"pose_priors": f"{_PRIORS}, position_covariance BLOB, {_OF_IMAGE}"}, {}),
-    "3.12": (
-        3900,
-        {
-            "rigs": "rig_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, ref_sensor_id INTEGER NOT NULL, "
-            "ref_sensor_type INTEGER NOT NULL",
-            "rig_sensors": f"rig_id INTEGER NOT NULL, {_SENSOR}, sensor_from_rig BLOB, {_OF_RIG}",
-            "frames": f"frame_id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, rig_id INTEGER NOT NULL, {_OF_RIG}",
-            "frame_data": f"frame_id INTEGER NOT NULL, data_id INTEGER NOT NULL, {_SENSOR}, "
-            "FOREIGN KEY (frame_id) REFERENCES frames (frame_id) ON DELETE CASCADE",
-        },
-        {
-            "rig_ref_sensor_assignment": "rigs (ref_sensor_id, ref_sensor_type)",
-            "rig_sensor_assignment": "rig_sensors (sensor_id, sensor_type)",
-            "frame_sensor_assignment": "frame_data (data_id, sensor_type)",
-        },
-    ),
-    "3.13": (3900, {}, {}),
-    "4.0": (
-        4_00_00_00,
-        {
-            "descriptors": f"{_IMAGE_KEY}, type INTEGER NOT NULL, {_MATRIX}, {_OF_IMAGE}",
-            "pose_priors": "pose_prior_id INTEGER NOT NULL PRIMARY KEY, corr_data_id INTEGER NOT NULL, "
-            "corr_sensor_id INTEGER NOT NULL, corr_sensor_type INTEGER NOT NULL, position BLOB, "
-            "position_covariance BLOB, gravity BLOB, coordinate_system INTEGER NOT NULL",
-        },
-        {"pose_prior_data_assignment": "pose_priors (corr_data_id, corr_sensor_id, corr_sensor_type)"},
-    ),
-    "4.1": (4_01_00_00, {}, {}),
-    "4.2": (4_02_00_00, {"two_view_geometries": f"{_GEOMETRIES}, camera1 BLOB, camera2 BLOB"}, {}),
+    "FOREIGN KEY (camera_id) REFERENCES cameras (camera_id)",
+    "keypoints": _ARRAY,
+    "descriptors": _ARRAY,
+    "matches": _PAIRS,
+    "two_view_geometries": f"{_PAIRS}, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB",
 }
-"""Stamp of each version's first release, and the tables and indices that it added or changed, the oldest first."""
-
-SCHEMAS: dict[str, Schema] = {}
-"""All published schemas by name, the oldest first."""
-_tables, _indices = {}, {}
-for _name, (_stamp, _new_tables, _new_indices) in _CHANGES.items():
-    _tables, _indices = _tables | _new_tables, _indices | _new_indices
-    SCHEMAS[_name] = Schema(_name, _stamp, _tables, _indices)
+"""Declaration of each table."""
 
 
-def find_schema(name: str) -> Schema:
-    if name not in SCHEMAS:
-        raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
-    return SCHEMAS[name]
-
-
-def schema_of_version(version: str) -> Schema:
-    """Returns the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and writes."""
-    release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
-    if release is None or release[1] not in SCHEMAS:
-        versions = ", ".join(SCHEMAS)
-        fault = f"COLMAP {version}: its database schema is not known"
-        raise InputError("E-COLMAP-VERSION", f"{fault}; use a release of {versions}")
-    return SCHEMAS[release[1]]
+def require_version(version: str) -> None:
+    """Refuses a COLMAP program of a ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) that is not known to open it."""
+    if ".".join(version.split(".")[:2]) not in VERSIONS:
+        fault = f"COLMAP {version}: not known to open the database"
+        raise InputError("E-COLMAP-VERSION", f"{fault}; use a release of {', '.join(VERSIONS)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +60,7 @@ class Exported:
     """Summary of an exported database."""
 
     path: Path
-    schema: str
+    schema: str  # version of COLMAP that was asked for
     images: int
     pairs: int  # of images with a two-view geometry
     camera_models: tuple[str, ...]  # COLMAP's names
@@ -137,7 +68,7 @@ class Exported:
 
 @require_arguments
 def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
-    """Writes the database of a run for another version of COLMAP, with the same ids, orders and values.
+    """Writes the database of a run for any version of COLMAP, with the same ids, orders and values.
 
     Parameters
     ----------
@@ -146,18 +77,20 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
     out : str or Path
         New file; it appears complete or not at all.
     schema : str
-        Version of COLMAP that is to open it: ``3.8`` to ``4.2``.
+        Version of COLMAP that is to open it: ``3.8`` to ``4.2``. The form is that of 3.8 for all.
 
     Raises
     ------
     InputError
-        The schema is unknown, or ``out`` exists or cannot be written.
+        The version is unknown, or ``out`` exists or cannot be written.
     """
-    run, out, wanted = saved_run(run), Path(out), find_schema(schema)
+    run, out = saved_run(run), Path(out)
+    if schema not in VERSIONS:
+        raise InputError("E-OPTION-VALUE", f"schema {schema}: unknown; give one of {', '.join(VERSIONS)}")
     require_new(out)
     with _complete(out) as made:
-        pairs = write_copy(run, made, wanted)
-    return Exported(out, wanted.name, len(run.observations), pairs, (run.camera.colmap_model,))
+        pairs = write_copy(run, made)
+    return Exported(out, schema, len(run.observations), pairs, (run.camera.colmap_model,))
 
 
 @contextmanager
@@ -175,7 +108,7 @@ def _complete(place: Path) -> Iterator[Path]:
         raise
 
 
-def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
+def write_copy(run: SavedRun, path: Path) -> int:
     """Writes a new database of a run's images and labels; returns the number of its pairs. It is in rollback-journal
     mode, which is a single file that any program opens."""
     own = path.with_name(f"own-{path.name}")
@@ -183,14 +116,13 @@ def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:
     write_database(own, run.camera, run.observations, pairs, run.corrected_px)
     try:
         with closing(sqlite3.connect(path)) as copy, copy:
-            for table, declaration in wanted.tables.items():
+            for table, declaration in TABLES.items():
                 copy.execute(f"CREATE TABLE {table} ({declaration})")
-            for index, columns in wanted.indices.items():
-                copy.execute(f"CREATE UNIQUE INDEX {index} ON {columns}")
-            copy.execute(f"PRAGMA user_version = {wanted.user_version}")
+            copy.execute("CREATE UNIQUE INDEX index_name ON images (name)")
+            copy.execute(f"PRAGMA user_version = {USER_VERSION}")
             copy.commit()
             copy.execute("ATTACH ? AS own", (str(own),))
-            for table in wanted.tables:
+            for table in TABLES:
                 main, ours = (copy.execute(f"PRAGMA {name}.table_info({table})").fetchall() for name in ("main", "own"))
                 known = {name for _, name, *_ in ours}
                 columns = ", ".join(name for _, name, *_ in main if name in known)
@@ -205,7 +137,7 @@ def database_text(written: Exported) -> str:
     """Returns a text on the contents of the copied database, and how to open it."""
     content = f"{written.images} images, {written.pairs} pairs, camera model {', '.join(written.camera_models)}"
     how = f"colmap gui --database_path {written.path} --image_path IMAGES"
-    return f"schema {written.schema}, checked: {content}\nopen it with: {how}"
+    return f"for COLMAP {written.schema}: {content}\nopen it with: {how}"
 
 
 FORMATS = ("colmap-bin", "colmap-txt")  # formats of a model, which is a folder
