@@ -254,18 +254,17 @@ FORMS = {
 """Forms by the value of ``--form``."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExportedRun:
-    """An export that was written."""
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """A file or folder that was written."""
 
     path: Path
-    form: str
-    content: Content
+    text: str  # on what is in it, and what is not
 
 
 @require_arguments
-def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target") -> ExportedRun:
-    """Writes faces and circles to a new file, with σ if the form holds them, and returns the content.
+def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target") -> Exported:
+    """Writes faces and circles to a new file, with σ if the form holds them.
 
     Parameters
     ----------
@@ -297,16 +296,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     written = FORMS[form].write(content)
     save(path, written)
     require_same(path, path.read_bytes, written.encode())
-    return ExportedRun(path, form, content)
-
-
-def export_text(written: ExportedRun) -> str:
-    """Returns a text on the contents of the file, and on the results that it lacks."""
-    content, target = written.content, written.content.target
-    what = f"{len(target.target_from_face)} faces and {len(target.circles)} circles"
-    lines = [f"{what}, frame {content.root}, as {written.form}: {written.path}"]
-    if not target.face_covariance:
-        lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
-    if lost := FORMS[written.form].lost:
-        lines.append(f"not in it: {lost}")
-    return "\n".join(lines)
+    target, lost = content.target, FORMS[form].lost
+    what = f"{len(target.target_from_face)} faces and {len(target.circles)} circles, frame {name}, as {form}: {path}"
+    no_sigma = f"\nno σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint"
+    return Exported(path, f"{what}{'' if target.face_covariance else no_sigma}\nnot in it: {lost}")

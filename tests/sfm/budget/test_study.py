@@ -38,12 +38,12 @@ def test_errors_of_one_input_are_as_its_contribution_says(fixed, which):
     and σ₀ are estimated, to 2 %."""
     case, stated = fixed
     rows, source = rows_of(case, stated, which, DRAWS), source_of(stated, which)
-    for k, row in enumerate(stated.budget.rows):
+    for k, (measurand, _) in enumerate(stated.budget.rows):
         error = np.array([each[k] for each in rows])
-        covariance = row.measurand.covariance(source, 0.0)
+        covariance = measurand.unit**2 * measurand.covariance(source, 0.0)
         square = float(np.einsum("ni,ni->", error, np.linalg.solve(covariance, error.T).T))
         low, high = chi2.ppf([CHANCE, 1 - CHANCE], error.size) * [0.96, 1.04]
-        assert low < square < high, (row.measurand.name, row.measurand.kind, square / error.size)
+        assert low < square < high, (measurand.name, measurand.kind, square / error.size)
 
 
 @pytest.mark.parametrize("which", sampled(study.SINGLE))
@@ -53,7 +53,7 @@ def test_a_change_of_scale_is_foretold(fixed, which):
     single = study.single_inputs(1, 8)
     rows = [study.errors(case, stated, which, single[i], i) for i in range(8)]
     own = float(np.sqrt((single[:, study.SINGLE.index(which)] ** 2).mean()))
-    for k, row in enumerate(stated.budget.rows):
-        if row.measurand.kind == "distance":
+    for k, (measurand, row) in enumerate(stated.budget.rows):
+        if measurand.kind == "distance":
             spread = float(np.sqrt(np.mean([each[k] ** 2 for each in rows])))
             assert spread == pytest.approx(own * row.contributions[which], rel=0.03)

@@ -81,7 +81,7 @@ def database(small_run, tmp_path_factory):
     """Path of a copy of the run's database; the run's own one stays as it is."""
     path, before = tmp_path_factory.mktemp("databases") / "copy.db", state_of(small_run / "colmap")
     written = export_database(small_run, path, "3.13")
-    assert (written.schema, written.images, written.pairs, written.camera_models) == ("3.13", 8, 28, ("OPENCV",))
+    assert written.text.startswith("for COLMAP 3.13: 8 images, 28 pairs, camera model OPENCV\n")
     assert state_of(small_run / "colmap") == before
     assert list(path.parent.iterdir()) == [path]
     return path
