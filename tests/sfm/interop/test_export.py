@@ -5,7 +5,6 @@ import importlib
 import json
 import xml.etree.ElementTree as ElementTree
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -84,22 +83,6 @@ def test_xacro(files, faces, tmp_path):
 )
 def test_ros(files, faces, form, read):
     require_frames(read(files[form].read_text(encoding="utf-8")), faces)
-
-
-def test_opencv(files, faces):
-    storage = cv2.FileStorage(str(files["opencv"]), cv2.FILE_STORAGE_READ)
-    found = storage.getNode("faces")
-    assert found.size() == len(faces["target_from_face"])
-    for place, (face, matrix) in enumerate(faces["target_from_face"].items()):
-        own = found.at(place)
-        assert own.getNode("id").string() == face
-        np.testing.assert_allclose(own.getNode("target_from_face").mat(), matrix, rtol=0, atol=AGAIN_MM)
-        assert own.getNode("target_from_face_covariance").mat().tolist() == faces["target_from_face_covariance"][face]
-        labels = [f"{face}:{own.getNode('circles').at(i).string()}" for i in range(own.getNode("circles").size())]
-        assert own.getNode("centres").mat().tolist() == [faces["circles"][label] for label in labels]
-        assert own.getNode("radii").mat().ravel().tolist() == [faces["radius_mm"][label] for label in labels]
-        covariances = own.getNode("centres_covariance").mat().reshape(-1, 3, 3)
-        assert covariances.tolist() == [faces["circle_covariance_mm2"][label] for label in labels]
 
 
 def test_table(files, faces):
