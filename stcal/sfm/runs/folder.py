@@ -214,6 +214,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
         with as_written(run / "report.json"):
             checked(report, ReportFile)
+            files.json_text(report)  # no NaN, which Python's reader takes for a number
             page, gone = _report_page(run, report)
         notes += [f"{gone} overlays are no longer in the folder: the report is without them"] if gone else []
         contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
