@@ -182,7 +182,7 @@ def stated_by(case: Case) -> Stated:
 def errors(
     case: Case, stated: Stated, which: str, single: np.ndarray, seed: int, common: float = ONE_PLATE
 ) -> list[np.ndarray]:
-    """Error (r,) of each measurand of the budget in one simulated calibration, mm and rad; arguments as of
+    """Error (r,) of each measurand of the budget in one simulated calibration, µm and mdeg; arguments as of
     :func:`drawn`."""
     models, circles = drawn(case, which, single, np.random.default_rng([seed, 11]), common)
     if which == ALL:
@@ -194,7 +194,7 @@ def errors(
     true = np.array([circles[label] for label in joint.labels])
     xyz = joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction)
     away = align_rigid(true, xyz) @ xyz - true  # moved as one: derivatives are for small moves
-    return [each.measurand.jacobian @ away.ravel() for each in stated.budget.rows]
+    return [each.unit * each.jacobian @ away.ravel() for each, _ in stated.budget.rows]
 
 
 def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float, float], float, float]:
@@ -203,13 +203,13 @@ def study(case: Case, which: str, count: int, pool) -> tuple[tuple[float, float,
     stated, inputs = stated_by(case), list(single_inputs(1, count))
     rows = list(pool(errors, [case] * count, [stated] * count, [which] * count, inputs, range(count)))
     shares, inside = [], []
-    for k, own in enumerate(stated.budget.rows):
+    for k, (_, own) in enumerate(stated.budget.rows):
         length = np.array([np.linalg.norm(each[k]) for each in rows])
         predicted = own.standard if which == ALL else own.contributions[which]
         inside.append((length <= own.expanded).mean())
         if predicted > LEAST * own.standard:
             shares.append((length**2).mean() / predicted**2)
-    expected = np.mean([own.coverage for own in stated.budget.rows])
+    expected = np.mean([own.coverage for _, own in stated.budget.rows])
     single = 1 / np.sqrt(shares)
     return (1 / np.sqrt(np.mean(shares)), single.min(), single.max()), np.mean(inside), expected
 

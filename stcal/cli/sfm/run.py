@@ -230,10 +230,9 @@ def export_database(
     schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.1, 4.2."],
 ) -> None:
     """Copy the run's database in the form of COLMAP 3.8, which later versions open; ids and values stay the same."""
-    from stcal.sfm.interop.export_colmap import database_text
     from stcal.sfm.interop.export_colmap import export_database as export
 
-    say(database_text(export(run, out, schema)))
+    say(export(run, out, schema).text)
 
 
 @app.command(name="export-model")
@@ -244,9 +243,8 @@ def export_model(
 ) -> None:
     """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
     from stcal.sfm.interop.export_colmap import export_model as export
-    from stcal.sfm.interop.export_colmap import model_text
 
-    say(model_text(export(run, out, kind)))
+    say(export(run, out, kind).text)
     _warn_of_failures(run)
 
 
@@ -256,17 +254,16 @@ def export_run(
     out: Annotated[
         Path,
         "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV) or .csv.",
+        "1) or .csv.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv or csv."] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1 or csv."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and other programs, with σ if the form can hold them."""
     from stcal.sfm.interop.export import export_run as export
-    from stcal.sfm.interop.export import export_text
 
-    say(export_text(export(run, out, form, name)))
+    say(export(run, out, form, name).text)
     _warn_of_failures(run)
 
 

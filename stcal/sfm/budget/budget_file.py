@@ -7,7 +7,7 @@ both agree."""
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -21,7 +21,7 @@ from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.io.table import LENGTHS, read_table
 from stcal.report.text import join, number
 from stcal.sfm.budget import combine
-from stcal.sfm.budget.combine import FIELDS, Budget, GroupViews, Origin, Row, Statement
+from stcal.sfm.budget.combine import FIELDS, Budget, GroupViews, Kind, Measurand, Origin, Statement, Uncertainty
 from stcal.sfm.data.group_model import ImageObservations
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, Use, judgement_of
@@ -171,7 +171,7 @@ def _corrected(budget: Budget, ends: tuple[int, int], without: Sequence[str] = (
     used = [each for each in budget.sources if each.key not in without]
     variances = [float(measurand.covariance(each)[0, 0]) for each in used]
     estimated = sum(variance for each, variance in zip(used, variances, strict=True) if each.evaluation == "A")
-    return measurand.length_mm * (1 + budget.conditions.correction), sum(variances), estimated**2 / budget.freedom
+    return measurand.value * (1 + budget.conditions.correction), sum(variances), estimated**2 / budget.freedom
 
 
 def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLength:
@@ -184,9 +184,7 @@ def _tested(circles: Sequence[str], own: Length, reference: Length) -> TestedLen
     return TestedLength(tuple(circles), measured_mm, reference_mm, error, expanded, e_n)
 
 
-MICRO = 1e3
-MILLIDEGREES = 1e3 * float(np.degrees(1.0))
-PPM = 1e6
+MICRO, PPM = 1e3, 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,33 +207,6 @@ class SourceRow(Part):
     sigma: float | None
     unit: str
     words: str
-
-
-class Uncertainty(Part):
-    axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
-    contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
-    standard: float = Field(description="combined standard uncertainty of all of them together")
-    coverage_factor: float = Field(2.0, description="k, by the effective degrees of freedom")
-    expanded: float = Field(description="expanded uncertainty, k times `standard`")
-    coverage: float = Field(description="of `expanded`, by simulation")
-    degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
-
-    @classmethod
-    def of(cls, row: Row) -> "Uncertainty":
-        """Returns the uncertainty of a position or distance in µm, of a rotation or angle in mdeg."""
-        unit = MICRO if row.measurand.kind in ("position", "distance") else MILLIDEGREES
-        return cls(
-            axes=(unit * np.sqrt(np.diag(row.covariance))).tolist(),
-            contributions={key: unit * contribution for key, contribution in row.contributions.items()},
-            standard=unit * row.standard,
-            coverage_factor=row.coverage_factor,
-            expanded=unit * row.expanded,
-            coverage=row.coverage,
-            degrees_of_freedom=row.freedom,
-        )
-
-    def share(self, key: str) -> float:
-        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
 
 
 class FaceUncertainty(Part):
@@ -349,28 +320,32 @@ class BudgetFile(ResultFile):
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
         conditions, known = budget.conditions, budget.conditions.size_known
         answer, refused = answer_of(run), is_refused(run)
-        rows = [] if refused else [(row.measurand, Uncertainty.of(row)) for row in budget.rows]
-        position_um = {measurand.of: own for measurand, own in rows if measurand.kind == "position" and known}
         enlarged, poses = 1 + conditions.correction, run.faces.poses()
-        faces: dict[str, FaceUncertainty] = {}
+        rows: dict[Kind, list[tuple[Measurand, Uncertainty]]] = {kind: [] for kind in get_args(Kind)}
+        for measurand, own in () if refused else budget.rows:
+            rows[measurand.kind].append((measurand, own))
+        position_um = {measurand.name: own for measurand, own in rows["position"] if known}
+        faces = {
+            each.name: FaceUncertainty(
+                position_mm=(enlarged * poses[each.name].translation).tolist() if known else None,
+                rotation_vector_deg=poses[each.name].as_scipy().as_rotvec(degrees=True).tolist(),
+                position_um=position_um.get(each.name),
+                rotation_mdeg=own,
+            )
+            for each, own in rows["rotation"]
+        }
+        angles = [
+            AngleUncertainty(faces=list(each.of), angle_deg=float(np.degrees(each.value)), angle_mdeg=own)
+            for each, own in rows["angle"]
+        ]
+        distances = [
+            DistanceUncertainty(
+                circles=list(each.of), length_mm=each.value, corrected_mm=enlarged * each.value, distance_um=own
+            )
+            for each, own in rows["distance"]
+            if known
+        ]
         circles: dict[str, CircleUncertainty] = {}
-        angles, distances = [], []
-        for measurand, own in rows:
-            if measurand.kind == "rotation":
-                pose = poses[measurand.name]
-                faces[measurand.name] = FaceUncertainty(
-                    position_mm=(enlarged * pose.translation).tolist() if known else None,
-                    rotation_vector_deg=pose.as_scipy().as_rotvec(degrees=True).tolist(),
-                    position_um=position_um.get(measurand.of),
-                    rotation_mdeg=own,
-                )
-            elif measurand.kind == "angle":
-                a, b = (poses[face].rotation[:, 2] for face in measurand.of)
-                angle_deg = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-                angles.append(AngleUncertainty(faces=list(measurand.of), angle_deg=angle_deg, angle_mdeg=own))
-            elif measurand.kind == "distance" and known:
-                lengths = {"length_mm": measurand.length_mm, "corrected_mm": measurand.length_mm * enlarged}
-                distances.append(DistanceUncertainty(circles=list(measurand.of), **lengths, distance_um=own))
         variance = np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
         for label, own, freedom in zip(budget.joint.labels, variance, budget.circles_freedom, strict=True):
             xyz, sigma_um = enlarged * np.asarray(run.faces.circles[label]), (MICRO * np.sqrt(own)).tolist()

@@ -6,7 +6,8 @@ from pathlib import Path
 from stcal.io.files import RUN_MARKER
 from stcal.report.document import Block, Table, page_only, subheading
 from stcal.report.text import NONE, number, significant
-from stcal.sfm.budget.budget_file import BudgetFile, LengthTest, SourceRow, Uncertainty
+from stcal.sfm.budget.budget_file import BudgetFile, LengthTest, SourceRow
+from stcal.sfm.budget.combine import Uncertainty
 
 WHAT_U_IS = (
     "The expanded uncertainty U is the combined standard uncertainty multiplied by the coverage factor k = {k}, "

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import date, time
 from itertools import combinations, combinations_with_replacement, product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.random import Generator
@@ -21,6 +21,7 @@ from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.io.json import Finite, Part
 from stcal.io.toml import Strict, load_toml
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import uncertainty
@@ -342,7 +343,7 @@ class Measurand:
     kind: Kind
     of: tuple[str, ...]  # the face, two faces, or two circles
     jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
-    length_mm: float = 0.0  # of a distance
+    value: float = 0.0  # of an angle, rad, or a distance, mm
 
     def __post_init__(self):
         freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
@@ -351,27 +352,50 @@ class Measurand:
     def name(self) -> str:
         return " – ".join(self.of)
 
+    @property
+    def unit(self) -> float:
+        """Factor from mm to µm, or from rad to mdeg."""
+        return 1e3 if self.kind in ("position", "distance") else 1e3 * float(np.degrees(1.0))
+
     def covariance(self, source: BudgetSource) -> np.ndarray:
         """Covariance (r, r) from one source."""
         return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Row:
-    """The uncertainty of one measurand, mm or rad."""
+class Uncertainty(Part):
+    axes: list[float] = Field(description="combined standard uncertainties of x, y, z, or of the length")
+    contributions: dict[str, float] = Field(description="to `standard`, by key of the source")
+    standard: float = Field(description="combined standard uncertainty of all of them together")
+    coverage_factor: float = Field(2.0, description="k, by the effective degrees of freedom")
+    expanded: float = Field(description="expanded uncertainty, k times `standard`")
+    coverage: float = Field(description="of `expanded`, by simulation")
+    degrees_of_freedom: Finite = Field(description="effective ones, null for infinitely many")
 
-    measurand: Measurand
-    contributions: dict[str, float]  # by key of the source
-    covariance: np.ndarray
-    standard: float  # combined standard uncertainty
-    expanded: float  # k times that
-    coverage: float  # simulated, of ``expanded``
-    freedom: float  # effective degrees of freedom
+    @classmethod
+    def of(cls, measurand: Measurand, sources: Sequence[BudgetSource], freedom: int, rng: Generator) -> Self:
+        """Returns the uncertainty in the unit of the measurand."""
+        parts = {source.key: measurand.unit**2 * measurand.covariance(source) for source in sources}
+        covariance = np.sum(list(parts.values()), axis=0)
+        variance = float(np.trace(covariance))
+        estimated = sum(float(np.trace(parts[source.key])) for source in sources if source.evaluation == "A")
+        standard, effective = float(np.sqrt(variance)), effective_freedom(variance, estimated, freedom)
+        k = coverage_factor(effective)
+        values, vectors = np.linalg.eigh(covariance)
+        errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+        # The estimated variance scatters about the true one.
+        drawn = np.sqrt(rng.chisquare(effective, DRAWS) / effective) if np.isfinite(effective) else 1.0
+        return cls(
+            axes=np.sqrt(np.diag(covariance)).tolist(),
+            contributions={key: float(np.sqrt(max(np.trace(part), 0.0))) for key, part in parts.items()},
+            standard=standard,
+            coverage_factor=k,
+            expanded=k * standard,
+            coverage=float((np.linalg.norm(errors, axis=1) <= k * standard * drawn).mean()),
+            degrees_of_freedom=effective,
+        )
 
-    @property
-    def coverage_factor(self) -> float:
-        """k of ``expanded``."""
-        return coverage_factor(self.freedom)
+    def share(self, key: str) -> float:
+        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -395,16 +419,13 @@ class Budget:
     joint: JointResult
     reference_face: str
     sources: tuple[BudgetSource, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[tuple[Measurand, Uncertainty], ...]
     circles_covariance_mm2: np.ndarray  # (c, 3, 3) by circle of ``joint``, target frame
     circles_freedom: np.ndarray  # (c,) effective degrees of freedom of the circles
     freedom: int  # degrees of freedom of what this run estimates
     views: tuple[GroupViews, ...]
     statement: Statement
     conditions: StatedConditions  # for which lengths hold; their correction is not applied to the run's result
-
-    def of_kind(self, kind: Kind) -> list[Row]:
-        return [row for row in self.rows if row.measurand.kind == kind]
 
 
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
@@ -439,7 +460,7 @@ def budget(
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
     every = measurands(joint, own, reference_face)
-    rows = tuple(_row(measurand, sources, freedom, rng) for measurand in every)
+    rows = tuple((each, Uncertainty.of(each, sources, freedom, rng)) for each in every)
     views = tuple(GroupViews.of(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
@@ -468,7 +489,9 @@ def _angle(own: Derivatives, a: str, b: str) -> Measurand:
     first, second = (own.target_from_face[face].rotation[:, 2] for face in (a, b))
     about = np.cross(first, second)[None]
     about = about / np.linalg.norm(about) if np.linalg.norm(about) > PARALLEL else null_space(first[None]).T
-    return Measurand("angle", (a, b), about @ (own.faces[b][:3] - own.faces[a][:3]))
+    jacobian = about @ (own.faces[b][:3] - own.faces[a][:3])
+    value = float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
+    return Measurand("angle", (a, b), jacobian, value)
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
@@ -488,20 +511,3 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
     jacobian[j], jacobian[i] = difference / length, -difference / length
     ends = joint.labels[i], joint.labels[j]
     return Measurand("distance", ends, jacobian.reshape(1, -1), length)
-
-
-def _row(measurand: Measurand, sources: Sequence[BudgetSource], freedom: int, rng: Generator) -> Row:
-    """Returns the uncertainty of a measurand."""
-    covariances = {source.key: measurand.covariance(source) for source in sources}
-    covariance = np.sum(list(covariances.values()), axis=0)
-    variance = float(np.trace(covariance))
-    estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
-    standard, effective = float(np.sqrt(variance)), effective_freedom(variance, estimated, freedom)
-    expanded = coverage_factor(effective) * standard
-    values, vectors = np.linalg.eigh(covariance)
-    errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
-    # The estimated variance scatters about the true one.
-    drawn = np.sqrt(rng.chisquare(effective, DRAWS) / effective) if np.isfinite(effective) else 1.0
-    coverage = float((np.linalg.norm(errors, axis=1) <= expanded * drawn).mean())
-    contributions = {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()}
-    return Row(measurand, contributions, covariance, standard, expanded, coverage, effective)

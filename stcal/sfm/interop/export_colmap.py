@@ -10,7 +10,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
 from stcal.labels import DotLabel
-from stcal.sfm.interop.export import BOARD_RGB, colours, require_free, require_new
+from stcal.sfm.interop.export import BOARD_RGB, Exported, colours, require_free, require_new
 from stcal.sfm.mapping.database import pycolmap, write_database
 from stcal.sfm.mapping.models import open_model, require_keypoints, write_reconstruction
 from stcal.sfm.mapping.pairs import image_graph
@@ -55,17 +54,6 @@ def require_version(version: str) -> None:
         raise InputError("E-COLMAP-VERSION", f"{fault}; use a release of {', '.join(VERSIONS)}")
 
 
-@dataclass(frozen=True, slots=True)
-class Exported:
-    """Summary of an exported database."""
-
-    path: Path
-    schema: str  # version of COLMAP that was asked for
-    images: int
-    pairs: int  # of images with a two-view geometry
-    camera_models: tuple[str, ...]  # COLMAP's names
-
-
 @require_arguments
 def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
     """Writes the database of a run for any version of COLMAP, with the same ids, orders and values.
@@ -90,7 +78,9 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
     require_new(out)
     with _complete(out) as made:
         pairs = write_copy(run, made)
-    return Exported(out, schema, len(run.observations), pairs, (run.camera.colmap_model,))
+    content = f"{len(run.observations)} images, {pairs} pairs, camera model {run.camera.colmap_model}"
+    how = f"colmap gui --database_path {out} --image_path IMAGES"
+    return Exported(out, f"for COLMAP {schema}: {content}\nopen it with: {how}")
 
 
 @contextmanager
@@ -133,30 +123,13 @@ def write_copy(run: SavedRun, path: Path) -> int:
     return len(pairs)
 
 
-def database_text(written: Exported) -> str:
-    """Returns a text on the contents of the copied database, and how to open it."""
-    content = f"{written.images} images, {written.pairs} pairs, camera model {', '.join(written.camera_models)}"
-    how = f"colmap gui --database_path {written.path} --image_path IMAGES"
-    return f"for COLMAP {written.schema}: {content}\nopen it with: {how}"
-
-
 FORMATS = ("colmap-bin", "colmap-txt")  # formats of a model, which is a folder
 LABELS = "labels.csv"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
 
-@dataclass(frozen=True, slots=True)
-class ExportedModel:
-    """Summary of an exported model."""
-
-    path: Path
-    labels: Path
-    images: int
-    points: int
-
-
 @require_arguments
-def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
+def export_model(run: AnyRun, out: str | Path, form: str) -> Exported:
     """Writes the final model of a run in COLMAP's binary or text format: mm, target frame, labels beside it.
 
     It appears complete or not at all. The model's files must be as the run wrote them.
@@ -194,7 +167,8 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
         folder.mkdir()
         (folder / LABELS).write_text(csv_text([LABEL_COLUMNS, *rows]), encoding="utf-8")
         write_reconstruction(reconstruction, folder, text=form == "colmap-txt")
-    return ExportedModel(out, out / LABELS, len(reconstruction.reg_image_ids()), len(rows))
+    counts = f"{len(reconstruction.reg_image_ids())} images and {len(rows)} points"
+    return Exported(out, f"{counts}; mm, target frame: {out}\nlabels: {out / LABELS}")
 
 
 def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Sequence]]:
@@ -228,8 +202,3 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[Seque
         group = groups.pop() if len(groups) == 1 else ""  # empty if several groups share the point
         rows.append([point_id, group, label, *map(repr, point.xyz.tolist()), *sigma])
     return reconstruction, rows
-
-
-def model_text(written: ExportedModel) -> str:
-    counts = f"{written.images} images and {written.points} points"
-    return f"{counts}; mm, target frame: {written.path}\nlabels: {written.labels}"

@@ -250,7 +250,7 @@ def _by_label(planes: dict[str, list]) -> Block:
 
 def _left_out(report: dict) -> list[Block]:
     """Returns all that was left out, with reasons, and the notes."""
-    left, unseen = report["left_out"], report["summary"]["faces_not_seen"]
+    left = report["left_out"]
     blocks: list[Block] = []
     circles: dict[tuple[str, str], list[str]] = {}
     for circle in left["circles"]:
@@ -265,30 +265,18 @@ def _left_out(report: dict) -> list[Block]:
     ):
         if rows:
             blocks += [subheading(title), Table(heads, rows, css="text")]
-    if unseen:
-        blocks.append(f"Faces of the design that are not in the result: {join(unseen)}")
     return blocks or ["Nothing was left out"]
 
 
 def trust(report: dict, judgement: Judgement) -> list[Block]:
-    """Returns for what σ hold, and the worst value of each kind."""
-    summary, options = report["summary"], report["options"]
-    scale_from = summary.get("scale_from", ["board"])
-    if options["solve"] != "joint":
-        scope = (
-            "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
-            "the given intrinsics: an error of the camera calibration goes into the faces"
-        )
-    elif judgement.verdict == "no":
-        scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
-    else:
-        refined = options.get("refine_camera", False)
-        absent = [] if refined else ["the camera calibration"]
-        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if "board" in scale_from else []
-        size = " and ".join(SIZES[source] for source in scale_from)
-        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
-        if absent:
-            scope += f". An error of {' or of '.join(absent)} is not in them, and residuals hardly show it"
+    """Returns which errors no σ includes, and what residuals and chains tell of the σ."""
+    summary = report["summary"]
+    scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
+    if judgement.verdict != "no":
+        absent = [] if report["options"].get("refine_camera") else ["the camera calibration"]
+        pitch = "the pitch as a whole (100 ppm is 4 K on aluminium)"
+        absent += [pitch] if "board" in summary.get("scale_from", ["board"]) else []
+        scope = f"No σ includes an error of {' or of '.join(absent)}, and residuals hardly show it" if absent else ""
     factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
     larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
     of_groups = f"group by group, residuals are {larger} the centres' own σ"
@@ -305,12 +293,10 @@ def trust(report: dict, judgement: Judgement) -> list[Block]:
 
 def settings(report: dict) -> list[list[str]]:
     summary, options, camera = report["summary"], report["options"], report["camera"]
-    left_out, last_move = report["left_out"], summary["last_move_px"]
+    last_move = summary["last_move_px"]
     sizes = " × ".join(str(size) for size in camera["size_px"])
     solve, frame = str(options["solve"]), str(options["frame"])
     round_ = not report["faces"] or not report["faces"].keys() <= set(summary.get("printed_faces", []))
-    single = sum(row.get("gate") == "views" for row in left_out["circles"])
-    points = f"{len(left_out['circles']) - single} points; {single} more that one image of a group alone shows"
     source = "as given" if summary.get("camera_given", True) else "found from the photographs"
     eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
     rows = [
@@ -323,7 +309,6 @@ def settings(report: dict) -> list[list[str]]:
         ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
         ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
-        ["Left out", f"{len(left_out['files'])} files, {len(left_out['images'])} images, {points}"],
         ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
         [f"Camera, {source}", f"{camera['model']}, {sizes} px"],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],

@@ -172,14 +172,11 @@ class ReportAgain:
     """Result of :func:`report_again`."""
 
     files: tuple[Path, ...]  # page and PDF that were written
-    gone: int  # number of overlays that the page lacks
-    notes: tuple[str, ...] = ()  # on files that are not as the run left them
+    notes: tuple[str, ...]  # on overlays that the page lacks, and files that are not as the run left them
 
     def text(self) -> str:
         """Returns the text for the terminal."""
-        lines = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
-        lines += [f"note: {note}" for note in self.notes]
-        return "\n".join([*lines, *(f"report: {path}" for path in self.files)])
+        return "\n".join([*(f"note: {note}" for note in self.notes), *(f"report: {path}" for path in self.files)])
 
 
 @require_arguments
@@ -212,16 +209,18 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         raise InputError("E-OUTPUT-SUFFIX", f"{fault}; give {out.with_suffix('.html')}, and --pdf for {out.name}")
     if pdf:
         require_pdf()
-    notes = tuple(verify(run).notes(but=("report.html", files.REPORT_PDF)))
+    notes = verify(run).notes(but=("report.html", files.REPORT_PDF))
     with contextlib.nullcontext(run) if out else added_results(run) as stage:
         file, report = out or stage / "report.html", read_json(run / "report.json", "run", AGAIN)
         with as_written(run / "report.json"):
             checked(report, ReportFile)
+            files.json_text(report)  # no NaN, which Python's reader takes for a number
             page, gone = _report_page(run, report)
+        notes += [f"{gone} overlays are no longer in the folder: the report is without them"] if gone else []
         contents: dict[Path, str | bytes] = {file: page} | ({file.with_suffix(".pdf"): pdf_of(page)} if pdf else {})
         for place, content in contents.items():
             files.save(place, content)
-    return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), gone, notes)
+    return ReportAgain(tuple(contents) if out else tuple(run / place.name for place in contents), tuple(notes))
 
 
 def _report_page(run: Path, report: dict) -> tuple[str, int]:
@@ -329,7 +328,7 @@ def document_of(result: RunResult) -> Document:
 
 
 def _remarks(result: RunResult) -> Iterator[str]:
-    """Yields what was left out, on what the size and the camera rest, and what was corrected."""
+    """Yields what was left out, and on what the size and the camera rest."""
     unmapped = [f"left out {name}: {why}" for solution in result.solutions for name, why in solution.left_out.items()]
     noted = {image.observations.name: image.notes for image in result.labelled if image.notes}
     outliers = sum(len(solution.outliers) for solution in result.solutions)
@@ -346,14 +345,6 @@ def _remarks(result: RunResult) -> Iterator[str]:
         yield f"{outliers} {result.target_design.points} left out that contradict the others"
     yield from _on_size(result)
     yield from _on_camera(result)
-    calibration, of_dots = result.calibration, result.board_design.rim_mm
-    if calibration.rim_mm:
-        height, sigma = float(np.mean(list(calibration.rim_mm.values()))), calibration.rim_sigma_mm
-        source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
-        yield f"rims: faces are those of the luminous surface, behind rims of {height:.3f}{source}"
-    if of_dots:
-        before = f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated"
-        yield f"{before}, and no face depends on it"
     if result.options.solve == "paper" or not result.options.eccentricity:
         yield PUBLISHED if result.options.solve == "paper" else CONTROL
 

@@ -12,7 +12,7 @@ from stcal.design import faces_of_known_shape
 from stcal.geometry.arrays import rms
 from stcal.geometry.plane import fit_plane
 from stcal.io.images import Skipped
-from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, ResultFile, Vector, Vector3
+from stcal.io.json import ByFace, Part, ResultFile
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.data.group_model import MIN_POINTS, GroupModel, ImageObservations, Note, lost_groups
@@ -27,14 +27,6 @@ from stcal.sfm.runs.stages import GroupSolution
 
 MICRO = 1e3
 Row = dict[str, Any]
-
-
-class ReportCamera(Part):
-    model: str
-    size_px: list[int]
-    focal_px: Pair
-    centre_px: Pair
-    distortion: Vector
 
 
 class Remark(Part):
@@ -52,19 +44,6 @@ class LeftOut(Part):
     notes: list[Row]
 
 
-class CameraInSpace(Part):
-    image: str
-    group: str
-    position_mm: Vector3
-    axes: Matrix3
-
-
-class Space(Part):
-    cameras: list[CameraInSpace]
-    boards: dict[ByGroup, Points]
-    circles: dict[ByLabel, Vector3]
-
-
 class ReportFile(ResultFile):
     """Content of the report of a run."""
 
@@ -75,7 +54,7 @@ class ReportFile(ResultFile):
     options: Row = Field(
         description="`solve`, `frame`, `eccentricity`, `refine_camera`, `expect_faces`, `max_pair_angle_deg`"
     )
-    camera: ReportCamera = Field(
+    camera: Row = Field(
         description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
         "p1, p2, k3 … k6, and s1 … s4 of a lens with thin prisms"
     )
@@ -167,7 +146,7 @@ class ReportFile(ResultFile):
         "`blur` of the rims, σ in px; `light` as a pixel's noise in % of the contrast; each with the factor by which "
         "the σ of faces are larger, at most, than in good photographs (docs/howto/photograph.md)",
     )
-    scene: Space = Field(
+    scene: Row = Field(
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
         "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
     )
@@ -195,9 +174,9 @@ def report_of(result: RunResult) -> ReportFile:
         "camera": {
             "model": result.camera.colmap_model,
             "size_px": [result.camera.width, result.camera.height],
-            "focal_px": camera.focal,
-            "centre_px": camera.centre,
-            "distortion": camera.coefficients(),
+            "focal_px": camera.focal.tolist(),
+            "centre_px": camera.centre.tolist(),
+            "distortion": camera.coefficients().tolist(),
         },
         "summary": _summary(result, models, np.concatenate(list(residual.values()))),
         "faces": {face: face_row(result, face) for face in result.target.target_from_face},
@@ -401,8 +380,9 @@ def _scene(result: RunResult) -> Row:
     cameras, boards = [], {}
     for model in result.calibration.models:
         for image, pose in zip(model.images, model.camera_from_model, strict=True):
-            position_mm = pose.inverse().translation
-            cameras.append({"image": image, "group": model.group, "position_mm": position_mm, "axes": pose.rotation})
+            place = {"position_mm": pose.inverse().translation.tolist(), "axes": pose.rotation.tolist()}
+            cameras.append({"image": image, "group": model.group, **place})
         if dots := [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]:
-            boards[model.group] = model.xyz_model[dots]
-    return {"cameras": cameras, "boards": boards, "circles": result.target.circles}
+            boards[model.group] = model.xyz_model[dots].tolist()
+    circles = {str(label): xyz.tolist() for label, xyz in result.target.circles.items()}
+    return {"cameras": cameras, "boards": boards, "circles": circles}

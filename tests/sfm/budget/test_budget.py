@@ -60,6 +60,11 @@ def plain(saved):
     return budget_of_run(saved)
 
 
+def rows_of(budget, kind):
+    """Measurands of a kind with their uncertainties, µm or mdeg."""
+    return [row for row in budget.rows if row[0].kind == kind]
+
+
 @pytest.fixture
 def stated(saved, tmp_path):
     path = tmp_path / "lab.toml"
@@ -70,22 +75,22 @@ def stated(saved, tmp_path):
 def test_with_nothing_stated_it_is_the_runs_own_covariance_and_contributions_add_up_as_squares(saved, plain):
     """The run is read from files, so to their digits and the adjustment's last step. Its board has the default of
     0.005 mm, which nobody has measured."""
-    assert {row.measurand.name for row in plain.of_kind("position")} == {"2", "4", "5"}
-    for kind, part in (("position", slice(3, 6)), ("rotation", slice(3))):
-        for row in plain.of_kind(kind):
-            own = saved.faces.target_from_face_covariance[row.measurand.name][part, part]
-            np.testing.assert_allclose(row.covariance, own, rtol=0, atol=1e-3 * np.abs(own).max())
+    assert {face.name for face, _ in rows_of(plain, "position")} == {"2", "4", "5"}
+    for kind, part, unit in (("position", slice(3, 6), 1e3), ("rotation", slice(3), 1e3 * np.degrees(1))):
+        for face, found in rows_of(plain, kind):
+            own = unit**2 * np.diag(saved.faces.target_from_face_covariance[face.name])[part]
+            np.testing.assert_allclose(np.square(found.axes), own, rtol=0, atol=1e-3 * own.max())
     (dots,) = (row for row in plain.sources if row.key == "board_dots")
     assert (dots.origin, "the default" in dots.words) == ("assumed", True)
     assert len(plain.rows) == 3 + 3 + 6 + 5
     for face in BudgetFile.of(plain, saved, verify(saved.folder)).faces.values():
         for written in (face.position_um, face.rotation_mdeg):
             assert sum(written.share(key) for key in written.contributions) == pytest.approx(1)
-    for row in plain.rows:
+    for _, row in plain.rows:
         assert min(row.contributions.values()) >= 0
         assert np.hypot.reduce(list(row.contributions.values())) == pytest.approx(row.standard)
         # Student's k for 95.45 %; up to 99.3 % for three numbers alike; of 100 000 draws.
-        assert row.expanded == pytest.approx(student.ppf(norm.cdf(2), row.freedom) * row.standard)
+        assert row.expanded == pytest.approx(student.ppf(norm.cdf(2), row.degrees_of_freedom) * row.standard)
         assert 0.952 < row.coverage < 0.995
 
 
@@ -97,10 +102,10 @@ def test_photographs_that_differ_are_what_is_counted_and_sigma_are_as_large_as_c
     state, start = adjusted_run(saved)
     monkeypatch.setattr(combine, "adjusted_run", lambda _: (replace(state, differ=3.0), start))
     differing, images = budget_of_run(saved), sum(len(model.images) for model in plain.joint.models)
-    for before, larger, after in zip(plain.rows, enlarged.rows, differing.rows, strict=True):
+    for (_, before), (_, larger), (_, after) in zip(plain.rows, enlarged.rows, differing.rows, strict=True):
         assert larger.standard == pytest.approx(1.5 * before.standard, rel=0.02)
         assert before.standard < after.standard <= 3 * before.standard
-        assert images <= after.freedom < before.freedom
+        assert images <= after.degrees_of_freedom < before.degrees_of_freedom
 
 
 def test_what_is_stated_adds_its_part_and_one_thermometer_errs_in_the_difference_of_the_expansions(
@@ -111,8 +116,8 @@ def test_what_is_stated_adds_its_part_and_one_thermometer_errs_in_the_difference
     found = budget_of_run(saved, stated)
     ppm = {"board_pitch": 10.0, "board_temperature": 4.0, "board_expansion": 2.0}
     ppm |= {"target_temperature": 23.0, "target_expansion": 2.0}
-    for before, after in zip(plain.of_kind("distance"), found.of_kind("distance"), strict=True):
-        length = after.measurand.length_mm
+    for (_, before), (distance, after) in zip(rows_of(plain, "distance"), rows_of(found, "distance"), strict=True):
+        length = 1e3 * distance.value
         own = {key: 1e6 * after.contributions[key] / length for key in ppm}
         assert own == pytest.approx(ppm, rel=2e-3)  # a face that must be flat takes part of a change of scale
         added = sum((each * 1e-6 * length) ** 2 for each in own.values())
@@ -123,8 +128,8 @@ def test_what_is_stated_adds_its_part_and_one_thermometer_errs_in_the_difference
     assert origins["circle_centres"] == "estimated"
     assert found.conditions.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
     common = budget_of_run(saved, replace(stated, one_thermometer=True))
-    for before, after in zip(found.of_kind("distance"), common.of_kind("distance"), strict=True):
-        length = 1e-6 * after.measurand.length_mm
+    for (_, before), (distance, after) in zip(rows_of(found, "distance"), rows_of(common, "distance"), strict=True):
+        length = 1e-3 * distance.value
         assert after.contributions["temperature"] / length == pytest.approx(19.0, rel=5e-3)
         gone = {"board_temperature", "target_temperature"}
         assert set(before.contributions) - set(after.contributions) == gone
@@ -135,8 +140,8 @@ def test_what_is_stated_adds_its_part_and_one_thermometer_errs_in_the_difference
         replace(s, expansion_ppm_per_k=23.0, temperature_sigma_k=1.0) for s in (stated.board, stated.target)
     )
     alike = budget_of_run(saved, replace(stated, board=board, target=target, one_thermometer=True))
-    for row in alike.of_kind("distance"):
-        assert row.contributions["temperature"] / row.measurand.length_mm < 0.1e-6  # of 23 ppm each
+    for distance, row in rows_of(alike, "distance"):
+        assert row.contributions["temperature"] / (1e3 * distance.value) < 0.1e-6  # of 23 ppm each
     unstated = replace(stated, board=StatedSize(temperature_sigma_k=0.5), target=StatedSize(), one_thermometer=True)
     source, open_source = (
         next(each for each in found.sources if each.key == "temperature")
@@ -155,9 +160,9 @@ def test_rims_that_were_estimated_are_a_row(saved, plain):
     assert [each.origin for each in found.sources if each.key == "rims"] == ["estimated"]
     assert all(each.key != "rims" for each in plain.sources)
     normal = {face: np.array(m)[:3, 2] for face, m in saved.faces.target_from_face.items()}
-    for row in found.of_kind("position"):
-        apart = normal[row.measurand.name] - normal[saved.faces.reference_face]
-        assert row.contributions["rims"] == pytest.approx(0.005 * np.linalg.norm(apart), rel=0.02)
+    for face, row in rows_of(found, "position"):
+        apart = normal[face.name] - normal[saved.faces.reference_face]
+        assert row.contributions["rims"] == pytest.approx(5 * np.linalg.norm(apart), rel=0.02)
 
 
 def test_a_statement_goes_before_the_boards_own_which_its_file_keeps(saved, tmp_path):
@@ -366,9 +371,9 @@ def lengths_csv(path, plain, off_u=0.0, rows=4, sigma_mm=0.001, head="from,to,le
     for i, j in longest_of(plain.joint.labels, plain.joint.xyz_model)[:rows]:
         a, b = plain.joint.labels[i], plain.joint.labels[j]
         length = float(np.linalg.norm(plain.joint.xyz_model[i] - plain.joint.xyz_model[j]))
-        own = next(r for r in plain.of_kind("distance") if r.measurand.of == (a, b))
-        u = np.hypot(own.standard, sigma_mm)
-        k = student.ppf(norm.cdf(2), own.freedom * (u / own.standard) ** 4)
+        own = next(u for distance, u in rows_of(plain, "distance") if distance.of == (a, b))
+        u = np.hypot(1e-3 * own.standard, sigma_mm)
+        k = student.ppf(norm.cdf(2), own.degrees_of_freedom * (1e3 * u / own.standard) ** 4)
         cells = [a, b, f"{length - off_u * k * u:.9f}", str(sigma_mm)]
         lines.append(",".join(cells[: head.count(",") + 1]))
     path.write_text("\n".join(lines) + "\n")
@@ -401,18 +406,18 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, p
     alike = against_run(plain, plain, saved.folder, (saved.board_design, saved.board_design))
     assert alike.agrees
     assert "cannot be seen here" in alike.notes[0]
-    longest = plain.of_kind("distance")[0]
-    assert alike.lengths[0].circles == longest.measurand.of
+    distance, longest = rows_of(plain, "distance")[0]
+    assert alike.lengths[0].circles == distance.of
     assert alike.lengths[0].error_um == 0
-    k = student.ppf(norm.cdf(2), 2 * longest.freedom)
-    assert alike.lengths[0].expanded_um == pytest.approx(1e3 * k * np.sqrt(2) * longest.standard)
+    k = student.ppf(norm.cdf(2), 2 * longest.degrees_of_freedom)
+    assert alike.lengths[0].expanded_um == pytest.approx(k * np.sqrt(2) * longest.standard)
     path = tmp_path / "lab.toml"
     path.write_text("[board]\npitch_sigma_ppm = 50.0\n")
     stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
     same = against_run(stated, stated, saved.folder, (saved.board_design, saved.board_design))
     assert same.lengths[0].expanded_um == pytest.approx(alike.lengths[0].expanded_um)
     other = against_run(stated, stated, saved.folder, (saved.board_design, replace(saved.board_design, pitch_mm=20.0)))
-    pitch = 50e-6 * longest.measurand.length_mm
+    pitch = 50e-6 * distance.value
     wanted = np.hypot(alike.lengths[0].expanded_um, 2e3 * np.sqrt(2) * pitch)
     assert other.lengths[0].expanded_um == pytest.approx(wanted, rel=2e-3)
     assert other.notes == ()
@@ -470,13 +475,14 @@ def test_an_angle_is_that_of_the_normals_and_its_uncertainty_what_draws_of_the_c
     own = derivatives(plain.joint, adjusted_run(saved)[1], saved.target_design, saved.faces.frame)
     variances, axes = np.linalg.eigh(plain.joint.covariance_mm2)
     draws = axes * np.sqrt(np.maximum(variances, 0)) @ np.random.default_rng(0).standard_normal((len(axes), 2000))
-    for row in plain.of_kind("angle"):
+    for angle, row in rows_of(plain, "angle"):
         normals = [
             Rotation.from_rotvec((own.faces[face][:3] @ draws).T).apply(own.target_from_face[face].matrix()[:3, 2])
-            for face in row.measurand.of
+            for face in angle.of
         ]
         angles = np.arctan2(np.linalg.norm(np.cross(*normals), axis=1), np.sum(np.multiply(*normals), axis=1))
-        assert np.std(angles) == pytest.approx(row.standard, rel=0.06)  # 4 σ of 2000 draws
+        assert np.mean(angles) == pytest.approx(angle.value, abs=1e-5)
+        assert 1e3 * np.degrees(np.std(angles)) == pytest.approx(row.standard, rel=0.06)  # 4 σ of 2000 draws
 
 
 @pytest.mark.parametrize("of", ["many points", "edge on", "one plane"])
@@ -512,7 +518,7 @@ def fixed():
     return case, study.stated_by(case)
 
 
-def rows_of(case, stated, which, draws):
+def errors_of(case, stated, which, draws):
     single = study.single_inputs(1, draws)
     return [study.errors(case, stated, which, single[i], i, stated.common) for i in range(draws)]
 
@@ -528,13 +534,13 @@ def test_errors_of_one_input_are_as_its_contribution_says(fixed, which):
     """eᵀC⁻¹e of positions, rotations and distances; the board's dots erring as the run takes them to. σ of the centres
     and σ₀ are estimated, to 2 %."""
     case, stated = fixed
-    rows, source = rows_of(case, stated, which, DRAWS), source_of(stated, which)
-    for k, row in enumerate(stated.budget.rows):
+    rows, source = errors_of(case, stated, which, DRAWS), source_of(stated, which)
+    for k, (measurand, _) in enumerate(stated.budget.rows):
         error = np.array([each[k] for each in rows])
-        covariance = row.measurand.covariance(source)
+        covariance = measurand.unit**2 * measurand.covariance(source)
         square = float(np.einsum("ni,ni->", error, np.linalg.solve(covariance, error.T).T))
         low, high = chi2.ppf([CHANCE, 1 - CHANCE], error.size) * [0.96, 1.04]
-        assert low < square < high, (row.measurand.name, row.measurand.kind, square / error.size)
+        assert low < square < high, (measurand.name, measurand.kind, square / error.size)
 
 
 @pytest.mark.parametrize("which", sampled(study.SINGLE))
@@ -544,7 +550,7 @@ def test_a_change_of_scale_is_foretold(fixed, which):
     single = study.single_inputs(1, 8)
     rows = [study.errors(case, stated, which, single[i], i) for i in range(8)]
     own = float(np.sqrt((single[:, study.SINGLE.index(which)] ** 2).mean()))
-    for k, row in enumerate(stated.budget.rows):
-        if row.measurand.kind == "distance":
+    for k, (measurand, row) in enumerate(stated.budget.rows):
+        if measurand.kind == "distance":
             spread = float(np.sqrt(np.mean([each[k] ** 2 for each in rows])))
             assert spread == pytest.approx(own * row.contributions[which], rel=0.03)
