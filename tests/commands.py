@@ -127,7 +127,7 @@ CALLS = (
     Call("sfm report", "@run --out >page.html", 3.0),
     Call("sfm export-database", "@run +copy.db --schema 3.8"),
     *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt")),
-    *(Call("sfm export", f"@run +box.{suffix} --name box") for suffix in ("urdf", "xacro", "yaml", "csv")),
+    *(Call("sfm export", f"@run +box.{suffix} --name box") for suffix in ("urdf", "xacro", "yaml", "yml", "csv")),
     Call("sfm export", "@run +box.txt --form ros2"),
     Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
     Call("sfm faces", "@run/colmap/models --run @run --out +faces.json", 1.0),

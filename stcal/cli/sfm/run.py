@@ -254,10 +254,10 @@ def export_run(
     out: Annotated[
         Path,
         "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1) or .csv.",
+        "1), .yml (OpenCV) or .csv.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1 or csv."] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv or csv."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and other programs, with σ if the form can hold them."""

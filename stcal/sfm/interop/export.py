@@ -1,9 +1,10 @@
-"""Export of a finished run to files of other programs: robots' software, tables."""
+"""Export of a finished run to files of other programs: robots' software, OpenCV, tables."""
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -15,6 +16,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
 from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, ros1_launch, ros2_launch, xyzw
 from stcal.io.table import csv_text
+from stcal.io.toml import opencv_matrix
 from stcal.labels import CircleLabel
 from stcal.report.text import number
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -136,6 +138,37 @@ def table(content: Content) -> str:
     return csv_text(rows)
 
 
+def opencv(content: Content) -> str:
+    """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
+    covariances of circles."""
+    target, radius = content.target, content.run.faces.radius_mm
+    lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
+    lines += [f"reference_face: {_quoted(target.reference_face)}", f"said: {_list(content.said())}", "faces:"]
+    for face, pose in target.target_from_face.items():
+        labels = content.circles_of(face)
+        covariances = [target.circle_covariance[label] for label in labels if label in target.circle_covariance]
+        matrices = {"target_from_face": pose.matrix()}
+        if face in target.face_covariance:
+            matrices["target_from_face_covariance"] = target.face_covariance[face]
+        if labels:
+            matrices["centres"] = np.array([target.circles[label] for label in labels])
+            matrices["radii"] = np.array([[radius[label]] for label in labels])
+        if covariances:
+            matrices["centres_covariance"] = np.array(covariances).reshape(-1, 9)
+        lines += ["   -", f"      id: {_quoted(face)}", f"      circles: {_list([label.circle for label in labels])}"]
+        matrix_lines = [line for name, values in matrices.items() for line in opencv_matrix(name, values)]
+        lines.append(indent("\n".join(matrix_lines), "      "))
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _list(texts) -> str:
+    return "[ " + ", ".join(map(_quoted, texts)) + " ]"
+
+
 PLATE_M = 1e-4  # height of the cylinders that show circles. Their outer ends lie in the faces' planes.
 MM_M = 1 / METRE_MM
 
@@ -215,6 +248,7 @@ FORMS = {
     "tf2": Form(".yaml", tf2, FRAMES_ONLY),
     "ros2": Form(".py", lambda content: ros2_launch(content.statics(), content.said()), FRAMES_ONLY),
     "ros1": Form(".launch", lambda content: ros1_launch(content.statics(), _in_comments(content)), FRAMES_ONLY),
+    "opencv": Form(".yml", opencv, "cameras"),
     "csv": Form(".csv", table, "cameras, correlations"),
 }
 """Forms by the value of ``--form``."""
@@ -238,8 +272,8 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
         New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
-        and 1) or ``.csv``.
-    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "csv"}, optional
+        and 1), ``.yml`` (OpenCV) or ``.csv``.
+    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv"}, optional
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.
