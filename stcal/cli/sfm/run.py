@@ -255,11 +255,11 @@ def export_run(
     run: Run,
     out: Annotated[
         Path,
-        "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV), .csv, .gltf or .glb.",
+        "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py (a launch file of "
+        "ROS 2), .yml (OpenCV), .csv, .gltf or .glb.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb."] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, opencv, csv, gltf or glb."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""

@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
 from tests.outcome import fails_with
-from tests.support.static_transforms import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
+from tests.support.static_transforms import read_messages, read_ros2_launch, static_of_joint
 
 AGAIN_MM = 1e-9
 """Doubles in their shortest text, by way of metres and quaternions."""
@@ -82,9 +82,7 @@ def test_xacro(files, faces, tmp_path):
         require_frames(statics, faces)
 
 
-@pytest.mark.parametrize(
-    ("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch), ("ros1", read_ros1_launch)]
-)
+@pytest.mark.parametrize(("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch)])
 def test_ros(files, faces, form, read):
     require_frames(read(files[form].read_text(encoding="utf-8")), faces)
 
