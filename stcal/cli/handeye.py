@@ -123,7 +123,7 @@ def handeye(
     opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        "Write the transform to this file; may be repeated. Forms: ros2, moveit, moveit2, easy-handeye, easy-handeye2.",
+        "Write the transform to this file; may be repeated. Forms: ros2, easy-handeye, easy-handeye2.",
         Opt(metavar="FORM=FILE"),
     ] = None,
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",

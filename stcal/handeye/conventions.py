@@ -29,8 +29,6 @@ DOUBTFUL = 1.5  # factor by which the other setup must reduce the same product b
 WELL = np.radians(0.5), 5.0  # median residuals (rad, mm) up to which poses are not suspected
 LOST = 0.25
 """Share of the spread of the poses left unexplained, above which those of robot and camera have nothing in common."""
-RADIANS_AS_DEGREES = np.radians(11.0)
-"""Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 CALLED = (("robot", "robot"), ("board", "camera"))  # what messages and options call the two sides
 Guess = Callable[[Loop, bool], LoopState]
@@ -80,15 +78,12 @@ def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale:
         spread = _differ(loop)
         if np.divide(_typical(loop, guess, True), spread).max() > LOST:
             remedy = "pair each pose of the board with that of the flange at the same moment"
-            if radians := _as_of_radians(loop, by_images):
-                columns = f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that"
-                remedy = f"{columns} ends in -rad; if not, {remedy}"
-            elif turn <= WELL[0]:
+            if turn <= WELL[0]:
                 remedy = "as rotations agree, rows and conventions of rotation are right: check units, signs and "
                 remedy += "order of the columns of positions"
             else:
-                more = "check the camera file" if by_images else "look for another convention of rotations"
-                remedy += f", and {more}"
+                convention = "look for another convention of rotations, or radians where degrees were read"
+                remedy += f"; {convention}{', and check the camera file' if by_images else ''}"
             what = "positions" if turn <= WELL[0] else "poses"
             said = f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), "
             said += f"as if {what} of robot and camera did not belong together; {remedy}"
@@ -213,14 +208,6 @@ def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
         if not by_images:
             both = _changed(loop, reading.poses, "robot", "board")
             yield Candidate(f"with all {quaternions}, {reading.remedy}", both)
-
-
-def _as_of_radians(loop: Loop, by_images: bool) -> str:
-    """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
-    rotations = {"the robot": loop.stand_from_mount.rotation}
-    rotations |= {} if by_images else {"the board": loop.camera_from_board.rotation}
-    turns = {side: Rotation.from_matrix(r @ r[0].T).magnitude().max() for side, r in rotations.items()}
-    return " and ".join(side for side, turn in turns.items() if turn < RADIANS_AS_DEGREES)
 
 
 def _differ(loop: Loop) -> tuple[float, float]:

@@ -25,8 +25,6 @@ from stcal.io.static_transforms import (
     Static,
     fixed_joint,
     metres,
-    ros1_launch,
-    ros2_commands,
     ros2_launch,
     xyzw,
 )
@@ -284,9 +282,7 @@ def easy_handeye(result: HandEye, transforms: list[Static], name: str, second: b
 
 
 FORMS: dict[str, Callable[[HandEye, list[Static], str], str]] = {
-    "ros2": lambda result, transforms, _: ros2_commands(transforms, said_of(result)),
-    "moveit": lambda result, transforms, _: ros1_launch(transforms, said_of(result)),
-    "moveit2": lambda result, transforms, _: ros2_launch(transforms, said_of(result)),
+    "ros2": lambda result, transforms, _: ros2_launch(transforms, said_of(result)),
     "easy-handeye": easy_handeye,
     "easy-handeye2": partial(easy_handeye, second=True),
 }

@@ -1,8 +1,8 @@
 """Report of a hand-eye calibration, with figures of residuals and of the coverage of the image."""
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
+from stcal.geometry.camera import Camera
 from stcal.handeye.choose import ChosenWay
 from stcal.handeye.data.corner_views import Views
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop
@@ -10,6 +10,7 @@ from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.handeye_problem import FACTORS, HandEye
 from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
+from stcal.report.camera_figures import mean_residuals_figure, shown
 from stcal.report.document import (
     Block,
     Document,
@@ -28,7 +29,7 @@ from stcal.report.document import (
     tiles,
     verdict_word,
 )
-from stcal.report.svg import COLOURS, INK, Axes, Drawing, count_ticks, limits, round_below
+from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits
 from stcal.report.text import HEADS, NONE, number, transform_rows
 
 DEGREE = np.degrees(1.0)
@@ -39,11 +40,8 @@ ERRORS = {
     "pose_mm": ("3-D by pose mm", 1.0, 3),
 }
 """Heads, unit factors and digits of the errors on held-out poses."""
-CELLS = 60  # number of cells along the longer side of the image, in which views of the board are counted
+CELLS = (16, 12)  # number of cells across and down the image, in which corners are counted
 GOOD, BAD = COLOURS[0], COLOURS[1]
-BLUES = "#f7fbff #c6dbef #6baed6 #2171b5 #08306b"  # the ramp Blues of ColorBrewer, light to dark
-MOST_VECTORS = 1500  # largest number of residuals that are drawn over the image
-LONGEST = 0.06  # length at which the 95 % quantile of the residuals is drawn, as a share of the image's width
 SIGMA_NAMES = {
     "corner_px": ("corner in the image", "px", 1.0),
     "robot_rad": ("robot, rotation", "°", DEGREE),
@@ -95,7 +93,10 @@ def outcome_report(outcome: Outcome) -> Document:
     judgements = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], judged_by, css="text")
     asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
     told = {"To know": asides, "What the files were taken for": outcome.given.understood}
-    camera = Table(["<", "value", "± σ", "<unit"], _adjusted(outcome))
+    camera, adjusted = "", result.reprojection
+    if adjusted is not None and adjusted.camera_covariance is not None:
+        lens = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
+        camera = macro("verbatim", "\n".join(shown(lens)))
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *transforms,
@@ -107,7 +108,7 @@ def outcome_report(outcome: Outcome) -> Document:
         Table(["<what errs, and by how much", "σ", "<"], sigmas),
         _scale_text(outcome),
         f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
-        fold("Camera, as adjusted (first pixel's centre at 0, 0)", camera),
+        fold("Camera, as adjusted", camera),
         *(block for title, lines in told.items() if lines for block in (subheading(title), bullets(lines))),
         fold("What the verdict rests on", judgements, CHANCE),
     ]
@@ -130,7 +131,6 @@ def outcome_report(outcome: Outcome) -> Document:
             Section("Motions held out", _motions(outcome.motions), terminal=True),
             Section("Poses", poses),
             Section("Coverage of the image", [Html(lambda: html(*_coverage(outcome)))]),
-            Section("What the motions tell", _turns(outcome)),
             Section("Left out", [page_only(Table(["<image", "<reason"], outcome.given.left_out))]),
         ],
         banner=[
@@ -209,44 +209,31 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
 
 
 def _coverage(outcome: Outcome) -> list[Block]:
-    """Returns how much of the image the board covered, with the residuals over it."""
+    """Returns how much of the image the board covered, with the mean residuals over it."""
     views, board = outcome.given.views, outcome.result.reprojection
     if views is None:
         return []
+    measured, by = np.concatenate([view.xy_px for view in views.views]), "robot and transforms"
     if board is None:
-        measured, by = np.concatenate([view.xy_px for view in views.views]), "robot and transforms"
         residuals = np.concatenate(by_robot(outcome.result, outcome.given.pairs, views)) - measured
     else:
         measured, by = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)]), "the adjustment"
         residuals = board.residuals_px
-    finite, counts = np.isfinite(residuals).all(1), image_coverage(views)
-    measured, residuals, size = measured[finite], residuals[finite], (views.camera.width, views.camera.height)
-    factor = enlargement(residuals, size[0])
+    size, finite = (views.camera.width, views.camera.height), np.isfinite(residuals).all(1)
+    across, down = np.clip((measured[finite] / size * CELLS).astype(int), 0, np.array(CELLS) - 1).T
+    cell, cells = across * CELLS[1] + down, CELLS[0] * CELLS[1]
+    count = np.bincount(cell, minlength=cells)
+    total = np.column_stack([np.bincount(cell, each, cells) for each in residuals[finite].T])
+    mean = total / np.maximum(count, 1)[:, None]
     return [
-        f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
-        "nothing checks the distortion of the lens",
+        f"Corners were seen in {(count > 0).mean():.0%} of the cells of the image. Where they never were, nothing "
+        "checks the distortion of the lens",
         plot(
-            lambda: image_figure(size, counts, measured, residuals),
+            lambda: mean_residuals_figure(mean, count, CELLS, size),
             "coverage of the image",
-            f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
+            f"Mean residuals by {by} in cells of the image, and numbers of corners",
             "",
         ),
-    ]
-
-
-def _turns(outcome: Outcome) -> list[Block]:
-    """Returns what the rotations between poses tell of the transform."""
-    seen = outcome.result.observability
-    if seen is None:
-        return []
-    turns = enumerate(zip(seen.axes, np.degrees(seen.turns_rad), strict=True), 1)
-    rows = [[str(i), *(number(v, 3) for v in axis), number(turn, 2)] for i, (axis, turn) in turns]
-    return [
-        Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
-        "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
-        "transform is known well if the second rotation is large. If it is 0, the camera's place is undetermined "
-        "along the first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
-        f"{np.degrees(seen.sigma_rad):.3f}° and {seen.sigma_mm:.2f} mm in the worst direction",
     ]
 
 
@@ -275,17 +262,6 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     return headline
 
 
-def _adjusted(outcome: Outcome) -> list[list[str]]:
-    """Returns rows of the camera's parameters; none if they were not adjusted."""
-    camera, rows = outcome.camera or {"parameters": {}}, []
-    for name, value in camera["parameters"].items():
-        sigma = camera["sigma"].get(name, camera["sigma"].get("f") if name in ("fx", "fy") else None)
-        if value or sigma:
-            digits, unit = (3, "px") if name[0] in "fc" else (6, "")
-            rows.append([name, number(value, digits), number(sigma, digits), unit])
-    return rows
-
-
 def _pose_rows(result: HandEye) -> list[list[str]]:
     adjusted, rows = result.reprojection, []
     for i, (name, off) in enumerate(zip(result.names, result.residuals, strict=True)):
@@ -294,25 +270,6 @@ def _pose_rows(result: HandEye) -> list[list[str]]:
         row += [] if adjusted is None else [number(adjusted.rms_px(i), 3)]
         rows.append([*row, "left out" if result.outliers[i] else ""])
     return rows
-
-
-def image_coverage(views: Views) -> np.ndarray:
-    """Returns the number (rows, columns) of photographs in which the hull of the corners covers a cell of the image."""
-    width, height = views.camera.width, views.camera.height
-    cell = max(width, height) / CELLS
-    columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
-    # Pixel centres are integers: the image reaches from -0.5 on.
-    x = (np.arange(columns) + 0.5) * width / columns - 0.5
-    y = (np.arange(rows) + 0.5) * height / rows - 0.5
-    middle = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    counts = np.zeros(len(middle), int)
-    for view in views.views:
-        try:
-            sides = ConvexHull(view.xy_px).equations
-        except QhullError:  # all corners on a line
-            continue
-        counts += (middle @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
-    return counts.reshape(rows, columns)
 
 
 def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
@@ -336,25 +293,3 @@ def pose_bars(result: HandEye) -> Drawing:
             bars = [((i + 0.6, i + 0.6, i + 1.4, i + 1.4), (0, values[i], values[i], 0)) for i in shown]
             axes.lines(bars, fill=colour)
     return drawing
-
-
-def image_figure(size: tuple[int, int], counts: np.ndarray, seen: np.ndarray, off: np.ndarray) -> Drawing:
-    """Draws how often the board covered the image, and enlarged residuals ``off`` (n, 2) of corners ``seen`` (n, 2)."""
-    width, height = size
-    drawing = Drawing(6.0, 5.25 * height / width + 0.6)
-    axes = Axes(drawing, drawing.panels()[0], (-0.5, width - 0.5), (height - 0.5, -0.5))
-    shown = np.where(counts > 0, counts, np.nan)
-    most = max(int(counts.max()), 1)
-    axes.shade(shown, (-0.5, -0.5, width - 0.5, height - 0.5), -most / 3, 2.5 * most, BLUES, smooth=False)
-    sample = np.sort(np.random.default_rng(0).permutation(len(seen))[:MOST_VECTORS])
-    seen, off = seen[sample], enlargement(off, width) * off[sample]
-    axes.lines(np.stack([seen, seen + off], axis=2), BAD, 0.8)
-    axes.marks(*seen.T, kind="dot", size=1.6, colour=INK)
-    axes.frame("x, px", "y, px")
-    return drawing
-
-
-def enlargement(off: np.ndarray, width: float) -> float:
-    """Returns a round factor, 1 or more, that makes residuals (n, 2) visible on an image of this width."""
-    usual = float(np.quantile(np.linalg.norm(off, axis=1), 0.95)) if len(off) else 0.0
-    return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0

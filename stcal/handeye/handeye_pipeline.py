@@ -35,7 +35,7 @@ from stcal.handeye.remarks import (
     spoken,
 )
 from stcal.handeye.time_offset import TimeOffset
-from stcal.handeye.validate import LEAST_LEFT, Compared, HeldOutMotions, HeldOutPoses, compare, refitted, splits
+from stcal.handeye.validate import LEAST_LEFT, Compared, HeldOutMotions, HeldOutPoses, compare, cross_validate, splits
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.parallel import one_thread
 
@@ -269,7 +269,11 @@ def _of_outliers(outcome: Outcome) -> Finding:
     if others:
         said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
         which = _few(others) if flips else "these poses"
-        remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")
+        remedy = f"look at {which}: moved while the image was taken, or paired with another image"
+        if len(others) > MANY * count:
+            remedy = "so many suggest a wrong setup, poses of the robot beside those of other images, or a camera file "
+            remedy += "that does not fit"
+        remedies.append(remedy)
     word = BAD if len(bad) > MANY * count else CARE
     return Finding("Outliers", word, "; ".join(said), str(len(bad)), "0", "; ".join(remedies))
 
@@ -316,7 +320,9 @@ def validated(
                 options = choice.chosen.of(problem, prior).options
                 return Outcome(given, choice.result, choice.held_out, options=options, choice=choice)
             result = problem.solved(method).result
-            held_out = refitted(problem.mended(), method, rows, workers, progress) if len(rows) else None
+            if len(rows):
+                how = method, given.views, options, rows, workers, progress
+                held_out = cross_validate(given.pairs, problem.setup, *how)
         except DegenerateError as error:  # if not of all poses, then of those besides some
             result, notes = problem.solved(method).result, (f"no errors on poses held out: {error}",)
     return Outcome(given, held_out.widened(result) if held_out else result, held_out, compared, options, notes)

@@ -12,7 +12,7 @@ from stcal.geometry.arrays import Brief, ByValue, freeze, require_fields
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import remarks
-from stcal.handeye.conventions import check_conventions, flipped, repair
+from stcal.handeye.conventions import check_conventions, repair
 from stcal.handeye.data.corner_views import Views, resect
 from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.data.pose_pairs import FRAMES, HandEyePoses, Loop, LoopState, Motions, Setup, poses_with_log, rms_of
@@ -280,7 +280,8 @@ class HandEyeProblem:
             raise DegenerateError("E-HANDEYE-AXES", said)
         noise, evolution = options.noise, options.evolution
         unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
-        if method in AX_XB and not (used := poses_with_log(loop)).all():
+        by_logs = method in (*AX_XB, "de", "de-polished")
+        if by_logs and not (used := poses_with_log(loop)).all():
             left_out = ", ".join(name for name, u in zip(pairs.names, used, strict=True) if not u)
             notes = (*notes, Aside(f"left out, for they turn by more than 170° against others: {left_out}"))
             loop = loop[used]
@@ -295,7 +296,7 @@ class HandEyeProblem:
             if method == "zhao":
                 x = closed_form.convex(motions, unit_mm)
             else:
-                objective = closed_form.Objective(motions.with_log(method), unit_mm, evolution.weight)
+                objective = closed_form.Objective(motions, unit_mm, evolution.weight)
                 about = any(b is not None and b.centre is None for b in (evolution.bounds_rad, evolution.bounds_mm))
                 known_x = closed_form.solve_closed_form(loop, "park-martin", unit_mm)[0] if about else None
                 farthest = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
@@ -428,8 +429,7 @@ class HandEyeProblem:
         if self.part:
             return ()
         pairs, options, loop, good = self.pairs, self.options, self.loop, ~outliers
-        tilted = flipped(loop, x, closed_form.mean_pose(loop[good].chain(x)), outliers)
-        notes = remarks.of_outliers(pairs.names, outliers, residuals, tilted)
+        notes = remarks.of_outliers(pairs.names, outliers, residuals)
         moved = remarks.of_order(pairs.names, residuals, loop.jacobian(x), places(loop) is None)
         notes += moved or remarks.of_groups(pairs[good].names, residuals[good])
         if not (options.with_scale or options.four_dof):

@@ -282,21 +282,12 @@ def spoken(name: str) -> str:
     return f"pose {name}" if name.isdigit() else name
 
 
-def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray) -> Remarks:
-    """Returns notes on the poses left out, by residuals (m, 6); those of ``flips`` agree if tilted the other way."""
+def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray) -> Remarks:
+    """Returns a note on each pose that was left out, by residuals (m, 6)."""
     notes: list[str] = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
         said = f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"
-        notes.append(Aside(said))
-    if (outliers & ~flips).mean() > MANY:
-        said = f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
-        said += "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
-        notes.append(Grave(said))
-    if flips.any():
-        named = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
-        said = f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat "
-        said += f"target is, which its image hardly excludes: {named}; --undo-flips takes that one, or give images"
         notes.append(Aside(said))
     return tuple(notes)
 

@@ -188,19 +188,9 @@ def cross_validate(
     Raises StcalError: a split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
     problem = HandEyeProblem(pairs, setup, views, options or HandEyeOptions()).mended()
-    return refitted(problem, method, splits(len(pairs)) if rows is None else rows, workers, progress)
-
-
-def refitted(
-    problem: HandEyeProblem,
-    method: str | None,
-    rows: np.ndarray,
-    workers: int | None = 1,
-    progress: Callable[[int, int], None] | None = None,
-) -> HeldOutPoses:
-    """Returns the errors of :func:`cross_validate` for a problem after repair."""
+    rows = splits(len(pairs)) if rows is None else rows
+    slow = views is not None and method in (None, "reprojection")
     jobs = [(problem, method, out) for out in rows]
-    slow = problem.views is not None and method in (None, "reprojection")
     return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
 
 
@@ -275,8 +265,8 @@ def better_setup(problem: HandEyeProblem, rows: np.ndarray) -> tuple[str, ...]:
     try:
         if not problem.options.four_dof and SETUP_BETTER * _robust_miss(plain, setup) < _robust_miss(plain, opposite):
             return ()
-        in_either = (replace(plain, setup=each) for each in (setup, opposite))
-        first, other = (refitted(each, "pose", rows[:SETUP_SPLITS]).means() for each in in_either)
+        known = {"options": plain.options, "rows": rows[:SETUP_SPLITS]}
+        first, other = (cross_validate(plain.pairs, each, "pose", **known).means() for each in (setup, opposite))
     except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
         return ()
     (turn, shift), (other_turn, other_shift) = (list(each.values()) for each in (first, other))
@@ -329,7 +319,9 @@ def compare(
         result, held_out, reason = None, None, ""
         try:
             result = problem.solved(method).result
-            held_out = refitted(problem, method, rows, workers) if len(rows) else None
+            if len(rows):
+                known = {"options": problem.options, "rows": rows, "workers": workers}
+                held_out = cross_validate(problem.pairs, setup, method, problem.views, **known)
         except StcalError as error:
             reason = str(error)
         compared.append(Compared(method, result, held_out, reason))

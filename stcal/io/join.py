@@ -67,8 +67,8 @@ def join_tables(
         Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
     prefixes : (str, str)
         Prefix for the columns of a pose or a position in each table, ``x_mm`` to ``qz`` and covariances: ``("a", "b")``
-        for a registration, ``("base_from_flange_", "camera_from_board_")`` for hand-eye, ``("commanded_", "")`` to
-        verify a robot. Other columns keep their names; of two of one name, that of ``a`` is used.
+        for a registration, ``("commanded_", "")`` to verify a robot. Other columns keep their names; of two of one
+        name, that of ``a`` is used.
     quaternions : {"wxyz", "xyzw"}
         As of :func:`load_table`.
 

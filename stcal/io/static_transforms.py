@@ -1,7 +1,6 @@
 """Poses in the form of other programs: static transforms of ROS, in metres, and COLMAP's ``images.txt``."""
 
 import json
-import shlex
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
@@ -64,31 +63,8 @@ def fixed_joint(each: Static) -> str:
     )
 
 
-def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a shell script, with lines of a comment, that calls ``ros2 run tf2_ros static_transform_publisher`` for
-    each transform, all but the last one in the background."""
-    calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
-    head = ["#!/bin/sh", *(f"# {line}" for line in said)]
-    return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
-
-
-def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it."""
-    lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
-    for static in statics:
-        names = static.parent, static.child
-        if spaced := [name for name in names if name.split() != [name]]:
-            split = f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name"
-            raise InputError("E-FRAME-NAME", split)
-        words = [*_pose_words(static.pose), *names]
-        node = f"{static.child}_broadcaster".replace("/", "_")
-        lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
-        lines.append(f"      args={quoteattr(' '.join(words))} />")
-    return "\n".join(lines) + "\n</launch>\n"
-
-
 def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
+    """Return a launch file of ROS 2, with lines of a comment, as MoveIt 2's calibration plugin writes it."""
     text = "".join(f"# {line}\n" for line in said)
     text += "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n\n\n"
     text += "def generate_launch_description() -> LaunchDescription:\n    nodes = [\n"

@@ -1,7 +1,6 @@
 """Boards of any kind in images: their points, and the camera that took photographs of a board of corners or circles."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ from stcal.boards.board_designs import (
 from stcal.boards.finders import find_charuco, find_chessboard, shift_by_curves, straightened, why_no_chessboard
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
@@ -143,19 +142,7 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
         first = f" from {board_ids[0]}" if board_ids[0] else ""
         extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}{first}"
         return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}"
-    turned, few = replace(board, rows=board.columns, columns=board.rows), f"{few}, but {len(ids)} of its tags"
-
-    def corners(other: CharucoDesign) -> int:
-        view = None
-        with suppress(DegenerateError):
-            view = find_charuco(image, "", other)
-        return 0 if view is None else len(view)
-
-    best = max((replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)), key=corners)
-    if not corners(best):
-        return f"{few}, not where rows and columns of its file put them; correct them"
-    legacy = f", legacy = {str(best.legacy).lower()}" if best.legacy != board.legacy else ""
-    return f"{few}, as on a board of rows = {best.rows}, columns = {best.columns}{legacy}; correct its file"
+    return f"{few}, but {len(ids)} of its tags, not where rows, columns and legacy of its file put them; correct these"
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:

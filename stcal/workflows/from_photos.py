@@ -79,13 +79,6 @@ class FromPhotos:
         at = sigma.at(self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
         return np.where(compensated.found.usable, at, np.nan)
 
-    def moves(self) -> np.ndarray:
-        """Joint values to send minus those as drawn, (t, n), rad or mm; nan where one of them does not exist."""
-        compensated = self.compensated
-        if compensated is None or compensated.nominal is None:
-            return np.zeros((0, len(self.nominal.rows)))
-        return np.where(compensated.compared()[:, None], compensated.found.q - compensated.nominal.q, np.nan)
-
 
 MOST_NOTES = 20
 
@@ -107,23 +100,19 @@ def story(result: FromPhotos) -> list[str]:
     if compensated is None:
         return sentences
     sentences += compensated_summary(compensated)
-    sigma, moves, predicted = result.sigma_mm(), result.moves(), identified.predicted
-    finite, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
+    sigma, predicted = result.sigma_mm(), identified.predicted
+    finite = sigma[np.isfinite(sigma)]
     if len(finite) and predicted is not None:
         sentences.append(
             f"predicted σ of the tool's position there: {finite.min():.2g} to {finite.max():.2g} mm; at the measured "
             f"rows {rms(predicted.here_mm):.2g} mm RMS"
         )
-    if len(moved):
-        most = zip(np.abs(moved).max(axis=0) * result.nominal.shown, result.nominal.prismatic, strict=True)
-        motions = ", ".join(f"{v:.4f} mm" if slides else f"{v:.4f}°" for v, slides in most)
-        sentences.append(f"joints move by up to {motions}")
     return sentences
 
 
 def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     """Returns the report: the story, errors of each model of the arm, and links to the other files ``names``."""
-    compensated, targets = result.compensated, []
+    compensated = result.compensated
     notes = [
         *result.notes,
         *(f"{entry.name}: {entry.reason}" for entry in result.measured.left_out),
@@ -133,17 +122,6 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     errors = [
         [name, str(entry.rows), *(number(v, 4) for v in (entry.mean, entry.rms, entry.p95, entry.max))]
         for name, entry in result.errors.items()
-    ]
-    if compensated is not None:
-        values = np.column_stack([compensated.before_mm, result.sigma_mm(), result.moves() * result.nominal.shown])
-        rows = zip(compensated.targets.lines, compensated.found.status, values.tolist(), strict=True)
-        targets = [[str(line), status, *(number(v, 4) for v in row)] for line, status, row in rows]
-    joints = [f"J{i}, {'mm' if slides else '°'}" for i, slides in enumerate(result.nominal.prismatic, 1)]
-    at_targets = [
-        ShownTable(["line", "<status", "as drawn, mm", "σ, mm", *joints], targets),
-        "as drawn: where the joint values of the drawing really lead, by the identified arm; nothing is fitted here, "
-        "so that errors of the base count, unlike above. σ: of the tool's position after compensation, as predicted. "
-        "Then how far each joint moves",
     ]
     models = [
         ShownTable(["<position error, mm", "errors", "mean", "RMS", "95 %", "max"], errors),
@@ -159,7 +137,6 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         [
             Section("Result", story(result)),
             Section("Errors of the arm's models", models),
-            Section("At the targets", at_targets if targets else []),
             Section("To look at", [bullets(notes[:MOST_NOTES]), more]),
             Section("Each step", [links(pages), files]),
         ],

@@ -194,9 +194,8 @@ class _Photographs:
         self.images, skipped = find_images(folder)
         every = [image.name for image in self.images]
         times = times_of_images(every, files.image_times)
-        by_time = files.time_offset or files.image_times is not None
-        told = {"in_order": True, "at_times": by_time, "tolerance_s": files.tolerance_s}
-        found = paired(robot, every, str(folder), times, **told)
+        known = {"by_times": files.image_times is not None, "at_times": files.time_offset}
+        found = paired(robot, every, str(folder), times, in_order=True, **known, tolerance_s=files.tolerance_s)
         self.robot, self.timed, self.names = found.robot, found.timed, [every[j] for j in found.rows]
         self.left_out = [*((each.name, each.reason) for each in skipped), *found.left_out]
         self.understood = [f"robot: {robot.understood}", *found.lines]

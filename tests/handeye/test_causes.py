@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views, splits
 from stcal.handeye.data.pose_pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
-from stcal.handeye.handeye_pipeline import judged
+from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.remarks import Grave, SizeDoubt
 from stcal.handeye.validate import better_setup
@@ -87,8 +87,11 @@ def test_many_outliers_make_the_setup_suspect():
     pairs = drawn(15)
     places = pairs.camera_from_board.translation.copy()
     places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))
-    found = handeye(replace(pairs, camera_from_board=Poses(pairs.camera_from_board.rotation, places)))
-    assert any(note.startswith("5 of 15 poses contradict the others: with so many look first") for note in found.notes)
+    pairs = replace(pairs, camera_from_board=Poses(pairs.camera_from_board.rotation, places))
+    found = handeye(pairs)
+    (finding,) = [each for each in judged(Outcome(HandEyeInput("", pairs), found)).findings if each.title == "Outliers"]
+    assert (finding.word, finding.said[:13]) == ("do not use", "5 of 15 poses")
+    assert "so many suggest a wrong setup" in finding.remedy
 
 
 def test_a_board_at_the_base_needs_its_setup_stated():

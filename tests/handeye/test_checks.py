@@ -11,7 +11,9 @@ from stcal.errors import StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.conventions import repair
+from stcal.handeye.data.pose_content import HandEyeInput
 from stcal.handeye.data.pose_pairs import SETUPS, Loop
+from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.remarks import Observability
 from stcal.io.rotations import INVERTED
 from tests.levels import FULL
@@ -135,7 +137,7 @@ ROBOT_MISTAKES = {
     "flange_from_base": (Poses.inverse, "flange_from_base"),
     "metres": (times(1e-3), "the robot's lengths times 1000 … metres"),
     "micrometres": (times(1e3), "the robot's lengths divided by 1000 … unit robot=mm"),
-    "radians": (RADIANS, "angles of the robot are radians"),
+    "radians": (RADIANS, "radians where degrees were read"),
     "x y z w": (XYZW, "the robot's quaternions in another order … --rotation robot=xyzw"),
     "w x y z": (rolled(3, 0, 1, 2), "the robot's quaternions in another order … --rotation robot=wxyz"),
     "conjugated": (INVERTED.poses, "the robot's quaternions conjugated … sign of qw"),
@@ -285,8 +287,9 @@ def test_other_wrong_poses_are_no_flips():
         for row in (2, 7, 11):
             axis = rng.normal(size=3)
             poses[row] = poses[row] @ Rigid.exp([*(0.35 * axis / np.linalg.norm(axis)), 0, 0, 0])
-        notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(poses))).notes
-        assert not any("tilted the other way" in note for note in notes)
+        turned = HandEyePoses(pairs.base_from_flange, Poses.of(poses))
+        findings = judged(Outcome(HandEyeInput("", turned), handeye(turned))).findings
+        assert any(each.title == "Outliers" and "tilted" not in each.said for each in findings)
 
 
 @pytest.mark.parametrize(("sets", "most"), [(4, 0), pytest.param(200, 6, marks=FULL)])

@@ -189,10 +189,10 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
     ("words", "message"),
     [
         (("--export", "ros2=poses.csv"), "--export poses.csv: is an input of this command; give another name"),
-        (("--export", "ros2=a", "--export", "moveit=a"), "--export a: is also what --export writes"),
+        (("--export", "ros2=a", "--export", "easy-handeye=a"), "--export a: is also what --export writes"),
         (("--export", "ros2=a", "--out", "a"), "--export a: is also what --out writes"),
         (("--export", "ros2"), "--export ros2: no file; give ros2=FILE"),
-        (("--export", "kuka=a"), "--export kuka: unknown; one of ros2, moveit, "),
+        (("--export", "kuka=a"), "--export kuka: unknown; one of ros2, easy-handeye, "),
         (("--ros", "a", "--camera-frame", "link", "--parent", "camera_optical_frame"), "both 'camera_optical_frame'"),
         (("--parent", "tool0"), "--parent, --child, --camera-frame: only with --ros, --urdf or --export"),
         (("--sigma-px", 0.1), "--sigma-px, --sigma-board-mm: only with images"),

@@ -103,7 +103,7 @@ def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
     assert code == 0, error
     assert "poses by time: 4 times in 40 samples of robot.csv: 1 at a sample, 2 interpolated" in shown
     assert "images: 3 of 4 with a pose of the robot" in shown
-    assert "left out 200.5.png: 99.72 s after the samples of robot.csv" in shown
+    assert "left out 200.5.png: outside of robot.csv, 99.72 s from the nearest sample" in shown
     code, shown, error = command(*given, "--dry-run", "--time-tolerance", 100)
     assert code == 0, error
     assert "images: 4 of 4 with a pose of the robot" in shown

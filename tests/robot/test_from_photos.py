@@ -92,7 +92,7 @@ def swept(cell):
 
 
 @pytest.mark.slow
-def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_told(cell, swept):
+def test_each_model_errs_less_than_the_one_before_and_its_sigma_is_told(cell, swept):
     drawn, axes, same, held = (figures.rms for figures in swept.errors.values())
     assert drawn > 5 * held  # 0.5 mm and 1 mrad, of which base and tool take up a part
     assert axes < drawn / 2
@@ -107,13 +107,8 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_to
     assert 0.8 < np.median(sigma) / np.median(swept.identified.predicted.here_mm) < 1.25  # 0.97 to 1.06 of 20 arms
     assert cell.missed(swept) < 9
     said = story(swept)
-    moves = np.abs(np.degrees(swept.moves())).max(axis=0)
-    assert f"joints move by up to {', '.join(f'{v:.4f}°' for v in moves)}" in said
     assert any("axis method" in line and line.startswith("every joint is swept") for line in said)
     assert any(f"{sigma.min():.2g} to {sigma.max():.2g} mm" in line for line in said)
-    page = files_of(swept)["report.html"]
-    for line in swept.compensated.targets.lines:
-        assert f'<th scope="row">{line}</th>' in page
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Readers of the static transforms that ``stcal.io.static_transforms`` writes, as the other programs read them."""
 
 import ast
-import shlex
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -34,21 +33,6 @@ def static_of_joint(joint: ElementTree.Element) -> Static:
     place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
     pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
     return Static(parts["parent"]["link"], parts["child"]["link"], pose)
-
-
-def read_ros2_commands(text: str) -> list[Static]:
-    """Return the transforms in a script of :func:`ros2_commands`."""
-    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
-    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
-
-
-def read_ros1_launch(text: str) -> list[Static]:
-    """Return the transforms in a launch file of :func:`ros1_launch`."""
-    statics = []
-    for node in ElementTree.fromstring(text).findall("node"):
-        words = node.attrib["args"].split()
-        statics.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
-    return statics
 
 
 def read_ros2_launch(text: str) -> list[Static]:

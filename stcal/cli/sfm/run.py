@@ -253,11 +253,11 @@ def export_run(
     run: Run,
     out: Annotated[
         Path,
-        "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV) or .csv.",
+        "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py (a launch file of "
+        "ROS 2), .yml (OpenCV) or .csv.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv or csv."] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, opencv or csv."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and other programs, with σ if the form can hold them."""

@@ -88,9 +88,7 @@ def _row_names(table: Table, key: str) -> tuple[tuple[str, ...], bool]:
         raise InputError("E-TABLE-COLUMN-MISSING", said)
     column = next((name for name in (key, *NAMES) if name in table), None)
     if column := column or next((lower[name] for name in NAMES if name in lower), None):
-        values = tuple(table.text(column))
-        require_each_once(values, places_of(table), table.where)
-        return values, column == TIME
+        return tuple(table.text(column)), column == TIME
     number = next((lower[name] for name in NUMBERS if name in lower), None)
     values = tuple(table.text(number)) if number is not None else ()
     return values if len(set(values)) == len(table) else (), False
@@ -120,11 +118,8 @@ TUM = 8  # numbers in a line of a TUM trajectory
 NANOSECONDS = 19  # digits of a time in ns since 1970
 _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 _UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
-_BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
-"""A unit in the header of a table, which is no list of YAML."""
-_HEADER = re.compile(r"[^:\[{]*[,;\t]")
-_SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
-"""A header of columns between which spaces stand, of six names at least, as a pose needs."""
+_OF_YAML = re.compile(r"%YAML|[{\[]|-( |$)|[^,;\t]*:( |$)")
+"""First line of YAML; a header of a table has no colon before its first separator."""
 
 
 def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent:
@@ -172,14 +167,11 @@ def _content(path: Path, data: bytes, said: Said) -> PoseContent | None:
         convention = said_convention(said.rotation, "the numbers after x, y, z", where)
         rotation, words = rotations(values[:, 3:], convention, places, where)
         return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
-    name, *others = re.split(r"[\s,;]+", first, maxsplit=1)
-    named = _numbers(others[0]) if others and ":" not in name and name != "-" else None
-    if numbers := _numbers(first) or named:
-        if len(_numbers(first) or ()) == TUM:
-            return _of_tum(lines, [line for line in text.splitlines() if is_comment(line)], said, where)
+    if (numbers := _numbers(first)) and len(numbers) == TUM:
+        return _of_tum(lines, [line for line in text.splitlines() if is_comment(line)], said, where)
+    if numbers:
         raise _not_known(where, f"rows of {len(numbers)} numbers without a header")
-    of_table = _HEADER.match(_BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first)
-    return None if of_table else _of_yaml(text, said, where)
+    return _of_yaml(text, said, where) if _OF_YAML.match(first) else None
 
 
 def _not_known(where: str, found: str) -> InputError:
@@ -335,6 +327,7 @@ def read_pairs(path: Path, statements: Said, quaternions: Order = "wxyz") -> Han
         raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
     require_unsaid(statements, robot, camera)
     names = robot.places if robot.own else robot.called()
+    require_each_once(names, robot.places, str(path))
     return HandEyeInput.of(robot, camera, names, path.name, setup=content.setup)
 
 
@@ -371,6 +364,7 @@ def read_side(
     """
     content = read_content(path, statements.of(role), key, quaternions)
     side = settled(content, role, path, statements)
+    require_each_once(side.names, side.places[: len(side.names)], str(path))
     if side.own and not side.names:
         raise InputError("E-TABLE-COLUMN-MISSING", f"{path}: no column image or {TIME} to join its rows by; add one")
     return side, content.setup

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
+from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.table import LENGTHS
 
@@ -90,16 +90,11 @@ class HandEyePoses(Brief):
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
         sides = []
         for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
-            if not isinstance(matrices, Poses):
-                rigid = []
-                for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
-                    try:
-                        rigid.append(Rigid.from_matrix(matrix))
-                    except InputError as error:
-                        name = names[i] if i < len(names) else f"pose {i + 1}"
-                        raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
-                matrices = Poses.of(rigid)
-            sides.append(Poses(matrices.rotation, LENGTHS[unit] * matrices.translation))
+            try:
+                poses = matrices if isinstance(matrices, Poses) else Poses.from_matrices(matrices)
+            except InputError as error:
+                raise InputError(error.code, f"{where}: {side}: {error}") from error
+            sides.append(Poses(poses.rotation, LENGTHS[unit] * poses.translation))
         first, second = sides
         return cls(first, second, names=tuple(names), where=where)
 
@@ -120,14 +115,13 @@ class HandEyePoses(Brief):
         if not copies:
             return
         i, j = min((i, same[0]) for same in copies for i in same[1:])
-        pair, others = f"{self.where}: {self.names[j]} and {self.names[i]}", sum(map(len, copies)) - len(copies) - 1
+        pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
         moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
         turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
         said = f": the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
         said += f"{np.degrees(turned):.3g}°; give each its own pose of the board"
         if moved == 0 and turned < 1e-12:
-            more, out = (f", and {others} more pairs", "one of each") if others else ("", "one of them")
-            said = f"{more} are identical poses; take {out} out"
+            said = " are identical poses; keep one of each"
         raise InputError("E-POSES-IDENTICAL", f"{pair}{said}")
 
     def require_moving_flange(self):
@@ -360,15 +354,6 @@ class Motions:
     def has_log(self) -> np.ndarray:
         """Returns (k,) True where the logarithms of both rotations are well-conditioned."""
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
-
-    def with_log(self, method: str) -> "Motions":
-        good = self.has_log()
-        if good.sum() < 2:
-            said = f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
-            said += f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of "
-            said += "poses"
-            raise DegenerateError("E-HANDEYE-LARGE-TURNS", said)
-        return self[good]
 
 
 def poses_with_log(loop: Loop) -> np.ndarray:

@@ -39,6 +39,7 @@ def paired(
     *,
     named: bool = True,
     in_order: bool = False,
+    by_times: bool = False,
     at_times: bool = False,
     tolerance_s: float = TOLERANCE_S,
 ) -> Paired:
@@ -48,60 +49,80 @@ def paired(
 
     ``names`` : of the camera's poses, or their places where they are not ``named``; ``where`` : their file or folder;
     ``times`` : by name, if there are any; ``in_order`` : whether a robot's poses without names belong to names in their
-    order; ``at_times`` : whether the robot's poses at their times are needed, within ``tolerance_s`` of a sample.
+    order; ``by_times`` : whether times are needed; ``at_times`` : whether poses at the times are, also of equal ones;
+    ``tolerance_s`` : distance of a sample from a time at which none can be interpolated.
 
     Raises InputError: poses without names or times that are needed, or none that belongs to another.
     """
-    own, file = times_of(robot), Path(robot.where).name
-    if (at_times or robot.timed) and (own is None or times is None):
+    own, stream = times_of(robot), None
+    if (by_times or at_times or robot.timed) and (own is None or times is None):
         lacking, first = (robot.where, robot.called()[0]) if own is None else (where, names[0])
         said = f"{lacking}: no times of its poses or images, like {first}; give a column time_s, a TUM trajectory, "
         said += "images named by seconds (1689.25.png), or --image-times"
         raise InputError("E-POSES-UNTIMED", said)
     of_files = not robot.timed and any(stem_of(name) != name for name in robot.names)
-    stream, lines = None, ()
     if own and times and not of_files:
-        known, timed_rows = list(own.values()), [j for j, name in enumerate(names) if name in times]
-        wanted = [times[names[j]] for j in timed_rows]
-        if at_times or not set(wanted) <= set(known):
-            stream = Stream.of(known, robot.poses, file)
-            seconds = stream.after_origin(wanted)
-            taken = taken_at(stream, seconds, [names[j] for j in timed_rows], tolerance_s)
-            if not taken.rows:
-                said = f"{where}: none has a pose of the robot: first {', '.join(taken.left_out[0])}"
-                raise InputError("E-POSES-UNMATCHED", said)
-            rows = [timed_rows[k] for k in taken.rows]
-            unused = "covariances of the robot's poses are not used: they are of other times"
-            lines = (taken.said, *([] if robot.covariance is None else [unused]))
-            without_time = tuple((name, "no time") for name in names if name not in times)
-            at = tuple(names[j] for j in rows)
-            found = replace(robot, poses=taken.base_from_flange, names=at, places=at, covariance=None)
-            return Paired(found, rows, (*taken.left_out, *without_time), Timed(stream, seconds[taken.rows]), lines)
-        row_of = {time: i for i, time in enumerate(known)}
-        rows = [(row_of[time], j) for time, j in zip(wanted, timed_rows, strict=True)]
-        lines = () if all(robot.names[i] == names[j] for i, j in rows) else ("rows joined by their times as numbers",)
-        if len(row_of) == len(known) > len(rows):  # a stream, of which samples between images are no mistake
-            stream = Stream.of(known, robot.poses, file)
+        row_of = {time: i for i, time in enumerate(own.values())}
+        if at_times or not row_of.keys() >= set(times.values()):
+            return _interpolated(robot, list(own.values()), names, where, times, tolerance_s)
+        rows, how = [(row_of[times[name]], j) for j, name in enumerate(names) if name in times], "by their times"
+        if len(row_of) == len(robot) > len(rows):
+            stream = Stream.of(list(own.values()), robot.poses, Path(robot.where).name)
             stream = stream if stream.spacing_s() <= LONGEST_S else None
-    elif not robot.names and (in_order or not named):
-        rows, lines = _by_order(robot, names, where)
-    elif not robot.names or not named:
+    else:
+        rows, how = _by_names(robot, names, where, named, in_order)
+    a, b = ([row[k] for row in rows] for k in (0, 1))
+    exact = bool(robot.names) and all(robot.names[i] == names[j] for i, j in rows)
+    alone = []
+    for every, used, file in ((robot.called(), set(a), robot.where), (names, set(b), where)):
+        if not (stream and file == robot.where):  # samples between images are no mistake
+            alone += [(name, f"in {Path(file).name} alone") for i, name in enumerate(every) if i not in used]
+    timed = Timed(stream, stream.after_origin([times[names[j]] for j in b])) if stream and times else None
+    return Paired(robot[a], b, tuple(alone), timed, () if exact else (f"rows joined {how}",))
+
+
+def _interpolated(
+    robot: PoseSide,
+    own: Sequence[Decimal],
+    names: Sequence[str],
+    where: str,
+    times: Mapping[str, Decimal],
+    tolerance_s: float,
+) -> Paired:
+    """Returns the robot's poses at the times of names."""
+    timed_rows = [j for j, name in enumerate(names) if name in times]
+    stream = Stream.of(own, robot.poses, Path(robot.where).name)
+    seconds = stream.after_origin([times[names[j]] for j in timed_rows])
+    taken = taken_at(stream, seconds, [names[j] for j in timed_rows], tolerance_s)
+    if not taken.rows:
+        said = f"{where}: none has a pose of the robot: first {', '.join(taken.left_out[0])}"
+        raise InputError("E-POSES-UNMATCHED", said)
+    rows = [timed_rows[k] for k in taken.rows]
+    unused = "covariances of the robot's poses are not used: they are of other times"
+    lines = (taken.said, *([] if robot.covariance is None else [unused]))
+    at = tuple(names[j] for j in rows)
+    found = replace(robot, poses=taken.base_from_flange, names=at, places=at, covariance=None)
+    left_out = (*taken.left_out, *((name, "no time") for name in names if name not in times))
+    return Paired(found, rows, left_out, Timed(stream, seconds[taken.rows]), lines)
+
+
+def _by_names(
+    robot: PoseSide, names: Sequence[str], where: str, named: bool, in_order: bool
+) -> tuple[list[tuple[int, int]], str]:
+    """Returns rows of both that have one name, or in their order, and how they were joined."""
+    if not robot.names and (in_order or not named):
+        return _by_order(robot, names, where)
+    if not robot.names or not named:
         without, other = (where, robot.names[0]) if robot.names else (robot.where, names[0])
         said = f"{without}: no names or times of its poses, the other side has: {other} …"
         raise InputError("E-POSES-UNNAMED", f"{said}; name both, like with a column image")
-    elif (joined := partners(robot.names, names)) is None:
+    if (joined := partners(robot.names, names)) is None:
         said = f"{robot.where}, {where}: no name or time in common: {robot.names[0]} … in the one, {names[0]} … in the "
         raise InputError("E-POSES-UNMATCHED", f"{said}other; correct them")
-    else:
-        rows, lines = joined[0], (f"rows joined {joined[1]}",) if joined[1] else ()
-    a, b = ([row[k] for row in rows] for k in (0, 1))
-    alone = [] if stream else [(name, f"in {file} alone") for i, name in enumerate(robot.called()) if i not in set(a)]
-    alone += [(name, f"in {Path(where).name} alone") for j, name in enumerate(names) if j not in set(b)]
-    timed = Timed(stream, stream.after_origin([times[names[j]] for j in b])) if stream and times else None
-    return Paired(robot[a], b, tuple(alone), timed, lines)
+    return joined
 
 
-def _by_order(robot: PoseSide, names: Sequence[str], where: str) -> tuple[list[tuple[int, int]], tuple[str, ...]]:
+def _by_order(robot: PoseSide, names: Sequence[str], where: str) -> tuple[list[tuple[int, int]], str]:
     """Returns rows in the order of the numbers at the end of names, if each has one of its own."""
     if len(names) != len(robot):
         said = f"{robot.where}, {where}: {len(robot)} and {len(names)} poses or images"
@@ -109,17 +130,16 @@ def _by_order(robot: PoseSide, names: Sequence[str], where: str) -> tuple[list[t
     numbers, order = [trailing_number(name) for name in names], list(range(len(names)))
     if None not in numbers and len(set(numbers)) == len(numbers):
         order.sort(key=lambda j: numbers[j] or 0)
-    how = f"rows joined by their order, for the robot's have no names: {robot.places[0]} with {names[order[0]]}"
-    return list(enumerate(order)), (how,)
+    how = f"by their order, for the robot's have no names: {robot.places[0]} with {names[order[0]]}"
+    return list(enumerate(order)), how
 
 
 def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
-    """Returns the places of names in both lists that mean the same, and how they were matched, empty if they are equal:
-    without folder and ending, as they are, as times, or by the number at their ends, of which none occurs twice. None
-    where none match."""
+    """Returns the places of names in both lists that mean the same, and how they were matched: without folder and
+    ending, as they are, as times, or by the number at their ends, of which none occurs twice. None where none match."""
     ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
         (stem_of, "by names without folder and ending"),
-        (str, ""),
+        (str, "by their names"),
         (time_of, "by their times as numbers"),
         (trailing_number, "by the number at the end of each name, like"),
     )
@@ -132,8 +152,7 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
         rows = [(i, place[key]) for i, key in enumerate(one) if key is not None and key in place]
         if rows:
             i, j = rows[0]
-            how = f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
-            return rows, "" if all(first[i] == second[j] for i, j in rows) else how
+            return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
     return None
 
 

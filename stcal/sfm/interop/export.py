@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_same, save
-from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, ros1_launch, ros2_launch, xyzw
+from stcal.io.static_transforms import METRE_MM, Static, fixed_joint, messages, ros2_launch, xyzw
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.labels import CircleLabel
@@ -247,7 +247,6 @@ FORMS = {
     "xacro": Form(".xacro", xacro, "cameras, σ of circles; σ of faces is in comments"),
     "tf2": Form(".yaml", tf2, FRAMES_ONLY),
     "ros2": Form(".py", lambda content: ros2_launch(content.statics(), content.said()), FRAMES_ONLY),
-    "ros1": Form(".launch", lambda content: ros1_launch(content.statics(), _in_comments(content)), FRAMES_ONLY),
     "opencv": Form(".yml", opencv, "cameras"),
     "csv": Form(".csv", table, "cameras, correlations"),
 }
@@ -271,9 +270,9 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     run : str, Path, SavedRun or RunResult
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
-        New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
-        and 1), ``.yml`` (OpenCV) or ``.csv``.
-    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv"}, optional
+        New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` (a launch file of
+        ROS 2), ``.yml`` (OpenCV) or ``.csv``.
+    form : {"urdf", "xacro", "tf2", "ros2", "opencv", "csv"}, optional
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.

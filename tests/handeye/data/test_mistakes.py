@@ -123,7 +123,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         (TUM + TUM, ["line 1 and line 2 are both '1.5'"]),
         (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
         (TUM.replace("0.3", "nan"), ["not finite"]),
-        (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc or mitsubishi-abc"]),
+        (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc"]),
         (f"{EULER},q1,q2,q3,q4\n1,2,3,1,0,0,0\n", ["q1, q2, q3, q4 may be quaternions"]),
         (f"{EULER},euler_ZYX_1_deg,euler_ZYX_2_deg\n1,2,3,1,2\n", ["without euler_ZYX_3_deg; all 3 needed"]),
         (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["are both 'a'"]),
@@ -208,7 +208,7 @@ def test_rows_of_two_files_that_do_not_fit(tmp_path):
         read_two(tmp_path / "robot.txt", tmp_path / "b.npy", Said(), "image")
     late = [f"9{row}" if row[0] != "#" else row for row in Path(b).read_text().splitlines()]
     (tmp_path / "late.txt").write_text("\n".join(late))
-    with fails_with("E-POSES-UNMATCHED … late.txt … 9100.5 … 8996 … robot.txt … 0.02"):
+    with fails_with("E-POSES-UNMATCHED … late.txt … 9100.5 … robot.txt … 8996 … 0.02"):
         read_two(tmp_path / "robot.txt", tmp_path / "late.txt", Said(), "image")
     assert a.endswith("robot.txt")
     lines = Path(b).read_text().splitlines()
@@ -220,7 +220,8 @@ def test_rows_of_two_files_that_do_not_fit(tmp_path):
 @pytest.mark.parametrize(
     ("first", "second", "rows", "how"),
     [
-        (["a", "b"], ["b", "c"], [(1, 0)], ""),
+        (["a", "b"], ["b", "c"], [(1, 0)], "by names"),
+        (["x/a", "y/a"], ["y/a"], [(1, 0)], "by their names"),
         (["1.50", "2"], ["2.0", "1.5"], [(0, 1), (1, 0)], "by their times as numbers"),
         (["1500000000000000001"], ["1500000000.000000001"], [(0, 0)], "by their times as numbers"),
         (["x/a.png"], ["a.jpg"], [(0, 0)], "by names without folder and ending"),

@@ -19,8 +19,6 @@ from tests.outcome import fails_with
 from tests.support.static_transforms import (
     pose_of_metres,
     read_messages,
-    read_ros1_launch,
-    read_ros2_commands,
     read_ros2_launch,
 )
 
@@ -75,9 +73,7 @@ def read_urdf(text: str) -> list[Static]:
 
 
 READERS = {
-    "ros2": read_ros2_commands,
-    "moveit": read_ros1_launch,
-    "moveit2": read_ros2_launch,
+    "ros2": read_ros2_launch,
     "easy-handeye": read_easy,
     "easy-handeye2": read_easy,
     "ros": read_messages,
@@ -124,8 +120,6 @@ def test_the_link_has_the_optical_frame_in_it(form):
 def test_names_of_frames():
     with fails_with("E-FRAME-NAME … 'tool0'"):
         tree(result_of(Rigid()), "tool0", "tool0")
-    with fails_with("E-FRAME-NAME … 'tool 0'"):
-        text_of(result_of(Rigid()), "moveit", parent="tool 0")
     with fails_with("E-OPTION-FORM … --export … staubli … ros2"):
         exports_of(["staubli=flange.txt"], FORMS)
     for setup, own, other, beyond in (

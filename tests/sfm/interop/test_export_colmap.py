@@ -27,7 +27,7 @@ from stcal.sfm.interop.export_colmap import export_database, export_model
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with, refuses
 from tests.shared import own_copy, unsealed_copy
-from tests.support.static_transforms import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
+from tests.support.static_transforms import read_messages, read_ros2_launch, static_of_joint
 
 export = import_module("stcal.sfm.interop.export_colmap")
 
@@ -384,9 +384,7 @@ def test_xacro(files, faces, tmp_path):
         require_frames(statics, faces)
 
 
-@pytest.mark.parametrize(
-    ("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch), ("ros1", read_ros1_launch)]
-)
+@pytest.mark.parametrize(("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch)])
 def test_ros(files, faces, form, read):
     require_frames(read(files[form].read_text(encoding="utf-8")), faces)
 
