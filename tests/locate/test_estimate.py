@@ -134,7 +134,7 @@ def test_two_tags_that_contradict_are_rejected():
 
 
 def test_no_tag_is_refused():
-    empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0))
+    empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)))
     refuses("E-LOCATE-NO-TAG", locate, empty, LAYOUT, CAMERA)
 
 
