@@ -39,7 +39,7 @@ class KnownTarget:
 def known_target(scene: Scene, noise_px: float) -> KnownTarget:
     """The scene's target with the covariance of a calibration by its own images, centres of that noise."""
     start = CalibratedTarget(
-        scene.reference_face, scene.target_from_face, scene.circles_target, dict.fromkeys(scene.groups, Rigid())
+        scene.target.faces[0].id, scene.target_from_face, scene.circles_target, dict.fromkeys(scene.groups, Rigid())
     )
     models = true_models(scene, observe(scene, noise_px, np.random.default_rng(scene.seed)))
     joint = unmoved(models, scene.board, scene.camera, FLATNESS_MM).result(1.0)
