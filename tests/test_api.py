@@ -279,7 +279,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
         (lambda: RunOptions(exclude="12/a.jpg"), "E-FIELD-TYPE … exclude '12/a.jpg' … tuple"),
         (lambda: replace(FACE, xy_mm=[["0", "1"]] * len(FACE.ids)), "E-ARRAY-TYPE … face 1"),
         (lambda: Rigid.exp([0] * 6) and Rigid(translation=[0, "1", 2]), "E-ARRAY-TYPE … translation"),
-        (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]), "E-ARRAY-TYPE … rows … whole"),
+        (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None]), "E-ARRAY-TYPE … rows … whole"),
         (lambda: Camera(2.5, 3, [1, 1], [1, 1], [0] * 8), "E-FIELD-TYPE … width 2.5 … whole"),
         (lambda: HandEyePoses(Poses.of([Rigid()]).matrix(), Poses.of([Rigid()])), "E-FIELD-TYPE … Poses"),
         (lambda: Camera.from_opencv(SKEWED, [], SIZE), "E-CAMERA-MATRIX … 2.0 … skew"),

@@ -215,7 +215,7 @@ class Similarity(ByValue):
     def of(cls, linear: np.ndarray, translation: np.ndarray) -> "Similarity":
         """Return the similarity of a linear part (3, 3), a rotation times a scale, and a translation (3,)."""
         scale = float(np.cbrt(np.linalg.det(linear)))
-        return cls(scale, Rigid(linear / scale if scale > 0 else linear, translation))
+        return cls(scale, Rigid(linear / scale, translation))
 
     def matrix(self) -> np.ndarray:
         """Return the homogeneous 4×4 matrix, with the scale in its 3×3 part."""
@@ -385,10 +385,11 @@ def align(xyz_a, xyz_b, weights: np.ndarray | None, model: ModelName) -> tuple[n
     w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
     if (w < 0).any() or not w.any():
         raise DegenerateError("E-ALIGN-WEIGHTS", "alignment: weights are negative or all zero; positive weights needed")
-    if model == "affine" and _rank_below(3, b[w > 0]):
+    used = slice(None) if weights is None else w > 0
+    if model == "affine" and _rank_below(3, b[used]):
         fault = "alignment: the points are coplanar"
         raise DegenerateError("E-POINTS-COPLANAR", f"{fault}; an affine transform needs points off the plane")
-    if _rank_below(2, a[w > 0]) or _rank_below(2, b[w > 0]):
+    if _rank_below(2, a[used]) or _rank_below(2, b[used]):
         raise DegenerateError("E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line needed")
     (linear,), (translation,) = alignments(a[None], b[None], w / w.sum(), model)
     return linear, translation
@@ -423,7 +424,7 @@ def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _rank_below(rank: int, points: np.ndarray) -> bool:
     """Return whether points (n, 3) lie in fewer dimensions than ``rank``."""
-    centred = points - points.mean(0)
+    centred = points - points.sum(0) / len(points)
     values = np.linalg.eigvalsh(centred.T @ centred)
     if values[3 - rank] > 1e-12 * values[2]:  # clear without the SVD, which is slow for a million points
         return False

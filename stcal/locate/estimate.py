@@ -126,21 +126,18 @@ class SeenTags(Brief):
     """Corners of a layout's tags in one scene.
 
     ``rows`` : (k,) of the tags in the layout; ``corners_px`` : (k, 4, 2), with distortion; ``covariance_px2`` : (k, 8,
-    8) of the four corners of each, with the layout's additional σ of single corners; ``edge_sigma_px`` : (k,) σ of the
-    common shift of all edges of a tag.
+    8) of the four corners of each, with the common shift of its edges, and what the layout adds.
     """
 
     rows: np.ndarray
     corners_px: np.ndarray
     covariance_px2: np.ndarray
-    edge_sigma_px: np.ndarray
 
     def __post_init__(self):
         freeze(self, "rows", (None,), "rows", int)
         k = len(self.rows)
         freeze(self, "corners_px", (k, 4, 2), "tags' corners")
         freeze(self, "covariance_px2", (k, 8, 8), "corners' covariances")
-        freeze(self, "edge_sigma_px", (k,), "edges' σ")
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -245,12 +242,8 @@ def problem_of(
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.pixel_jacobian(ideal)
     seen_by_px = np.linalg.inv(px_by_seen)
-    # A tag's corners err as measured, by the edges' common shift, and by a shift of the whole tag.
-    direction, whole = corners_by_edges(detected.corners_px).reshape(-1, 8), np.tile(np.eye(2), (4, 1))
-    edges = detected.edge_sigma_px[:, None, None] ** 2 * direction[:, :, None] * direction[:, None]
-    of_tag = detected.covariance_px2 + edges + layout.tag_sigma_px**2 * whole @ whole.T
     in_seen = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
-    noise = block_diagonal(in_seen @ of_tag @ np.swapaxes(in_seen, 1, 2))
+    noise = block_diagonal(in_seen @ detected.covariance_px2 @ np.swapaxes(in_seen, 1, 2))
     intrinsics = np.zeros_like(noise)
     if prior is not None:
         by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
@@ -373,9 +366,12 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     root = np.repeat(weight_share, 2, axis=2)[..., None] * np.linalg.cholesky(joint)
     independent = np.einsum("enij,enlj->nil", root, root)
     common = np.einsum("enij,fnlj->nil", root, root)
-    merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(8)
+    shift = (weight_share.mean(2) * edge).sum(0)[:, None] * corners_by_edges(mean).reshape(-1, 8)
+    whole = layout.tag_sigma_px * np.tile(np.eye(2), (4, 1))
+    merged = growth * (differing * independent + (1 - differing) * common) + shift[:, :, None] * shift[:, None]
+    merged += layout.sigma_px**2 * np.eye(8) + whole @ whole.T
     return Merged(
-        SeenTags(used, mean, merged, (weight_share.mean(2) * edge).sum(0)),
+        SeenTags(used, mean, merged),
         share,
         _shifts(corners, covariance, visible, names or [str(k + 1) for k in range(len(exposures))]),
         tuple(sorted({tag for tags in exposures for tag in tags.repeated if tag in rows})),

@@ -9,7 +9,7 @@ from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER
 from stcal.register.registration import affine_least_squares, liu2017
 from tests.levels import sampled
 from tests.outcome import fails_with, refuses
-from tests.support.point_pairs import SIGMA_MM, directions, scene
+from tests.support.point_pairs import B_FROM_A, SIGMA_MM, directions, scene
 
 
 def cost_ratio(s, found) -> float:
@@ -287,3 +287,14 @@ def test_liu2017_options_that_cannot_be():
     refuses("E-LIU-OPTIONS … 1.5", Liu2017Options, share=1.5)
     refuses("E-LIU-OPTIONS … limit_mm … 0", Liu2017Options, limit_mm=0)
     refuses("E-LIU-OPTIONS … tries … 0", Liu2017Options, tries=0)
+
+
+def test_wrong_rows_may_recur_in_step_with_those_that_are_looked_at():
+    """Of 30 000 rows every third is wrong."""
+    rng = np.random.default_rng(3)
+    a = rng.uniform(-500, 500, (30_000, 3))
+    b = B_FROM_A @ a + rng.normal(0, 0.05, a.shape)
+    b[::3] += rng.uniform(-50, 50, (10_000, 3))
+    found = register(a, b, folds=0)
+    assert found.sigma_mm == pytest.approx(0.05, rel=0.02)
+    assert np.isin(np.arange(0, 30_000, 3), found.outliers).mean() > 0.999
