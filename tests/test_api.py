@@ -137,7 +137,7 @@ INPUTS = [
     locate.LocateOptions(),
     locate.VerdictOptions(),
     locate.PatentOptions(),
-    SeenTags([0], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]),
+    SeenTags([0], np.zeros((1, 4, 2)), np.eye(8)[None]),
     synthetic.SceneOptions(),
     synthetic.RenderOptions(),
     synthetic.BodyOptions(),
@@ -193,7 +193,6 @@ def test_errors_speak_of_arguments(monkeypatch):
         assert str(said).endswith(", or --out")
     assert errors.COMMAND_LINE not in os.environ
     assert str(pickle.loads(pickle.dumps(said))) == str(said)
-    monkeypatch.delenv(errors.COMMAND_LINE)
     refuses("E-OPTION-RANGE … flatness_mm 1e+09", RunOptions(flatness_mm=1e9).settled, reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
 

@@ -160,6 +160,8 @@ def test_each_function_script_and_command_is_there():
         module, _, function = name.rpartition(".")
         assert hasattr(import_module(module), function), name
     assert [name for name in SCRIPTS if not (ROOT / name).is_file()] == []
+    for call in CALLS:
+        parse(shlex.join(["stcal", *call.command.split(), *call.split()]))
     for text in NAMED:
         program, *words = shlex.split(text)
         words = ["sfm", *words] if program == "stcal-sfm" else words

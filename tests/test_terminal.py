@@ -236,9 +236,10 @@ def test_a_command_that_works_in_silence_says_what_it_is_at(capsys, monkeypatch,
 def test_a_quiet_command_says_errors_warnings_and_a_verdict_that_is_not_good_alone(program, tmp_path, capsys):
     """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
     for word in ("--quiet", "-q"):
-        assert program("robot", "init", tmp_path / "a.toml", word) == (0, "", "")
-        assert (tmp_path / "a.toml").exists()
-        assert_error(program("robot", "init", tmp_path / "a.toml", word), INPUT, "E-OUTPUT-EXISTS")
+        path = tmp_path / f"{word}.toml"
+        assert program("robot", "init", path, word) == (0, "", "")
+        assert path.exists()
+        assert_error(program("robot", "init", path, word), INPUT, "E-OUTPUT-EXISTS")
     with terminal.manner(True, False):
         terminal.print_each("note", ["a"])
         terminal.print_each("warning", ["b\x1b"])
@@ -349,13 +350,14 @@ def test_overwrite_replaces_what_is_there_and_calls_that_write_nothing_ask_for_n
 
 def test_outputs_are_kept_apart_from_one_another_and_from_what_is_read(tmp_path, monkeypatch):
     """A file beside a run's own is written again, and one in a folder of images, from where no command reads it."""
+    run = tmp_path / "run"
     for name in (RUN_MARKER, "advice.json", "faces.json"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("{}")
-    keep_apart([("--json", tmp_path / "advice.json")], [("run", tmp_path)])
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        (run / name).write_text("{}")
+    keep_apart([("--json", run / "advice.json")], [("run", run)])
     for name in RUN_ENTRIES:
-        (tmp_path / name).touch()
-        refuses("E-OUTPUT-IS-INPUT … run", keep_apart, [("--json", tmp_path / name)], [("run", tmp_path)])
+        (run / name).touch()
+        refuses("E-OUTPUT-IS-INPUT … run", keep_apart, [("--json", run / name)], [("run", run)])
     monkeypatch.chdir(tmp_path)
     refuses("E-OUTPUT-TWICE … --out", keep_apart, [("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
     refuses("E-OUTPUT-FOLDER … --out", keep_apart, [("--out", tmp_path)], [])

@@ -119,11 +119,24 @@ def test_circles_without_a_board_need_a_camera_and_tags_take_no_options_for_circ
 def observed(target, count: int, seed: int, distance_mm: float = 300):
     """Corners of a body in images, with noise, as detection would give them; and the scene."""
     scene = make_body_scene(target, body_camera(1200), BodyOptions(images=count, distance_mm=distance_mm, seed=seed))
-    return scene, with_noise(corners_seen(scene, SIGMA_PX)[0], np.random.default_rng(seed), SIGMA_PX)
-
-
-def with_noise(images, rng, sigma_px):
-    return [replace(i, centre_px=i.centre_px + rng.normal(0, sigma_px, i.centre_px.shape)) for i in images]
+    rng = np.random.default_rng(seed)
+    images = []
+    for i, pose in enumerate(scene.camera_from_target):
+        labels: list[CircleLabel] = []
+        pixels = []
+        for face in target.faces:
+            camera_from_face = pose @ scene.target_from_face[face.id]
+            middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
+            if -face.outward * camera_from_face.rotation[:, 2] @ middle > 0.3 * np.linalg.norm(middle):
+                labels += face.labels()
+                pixels.append(scene.camera.project(camera_from_face @ face.places_mm(face.ids)))
+        xy = np.concatenate(pixels)
+        xy = xy + rng.normal(0, SIGMA_PX, xy.shape)
+        zero = np.zeros((len(xy), 2, 2))
+        images.append(
+            ImageObservations(f"{i}.png", ".", tuple(labels), xy, 0 * xy, zero, zero + SIGMA_PX**2 * np.eye(2))
+        )
+    return scene, images
 
 
 def calibrated(target, images, size):
@@ -513,7 +526,8 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted_but_
     """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
     scene, images = corners
     rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
-    noisy = with_noise(images, np.random.default_rng(0), 0.02)
+    rng = np.random.default_rng(0)
+    noisy = [replace(each, centre_px=each.centre_px + rng.normal(0, 0.02, each.centre_px.shape)) for each in images]
     assert wrong_sizes(BodyCorners(noisy, CUBE.faces), rough)[0] == {}
     for faces, factor in (((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)):
         drawn = list(CUBE.faces)

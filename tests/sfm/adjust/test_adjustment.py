@@ -74,11 +74,11 @@ def test_adjustments_are_exact_without_noise_find_the_eccentricity_and_state_sig
     # A board that is the perfect grid: only then may the residuals vanish.
     ideal = replace(reference_board(), sigma_mm=1e-6)
     groups = (("1", "2"), ("1", "4"))
-    scene = make_scene(SceneOptions(seed=4, width=2592, height=1728, images_per_group=3, groups=groups), None, ideal)
-    target, joint = labels_only.calibrate(scene, 0.0, 0)
+    exact = make_scene(SceneOptions(seed=4, width=2592, height=1728, images_per_group=3, groups=groups), None, ideal)
+    target, joint = labels_only.calibrate(exact, 0.0, 0)
     assert joint.sigma0 < 0.05
     # The chained start leaves eccentricities of a nanometre.
-    for error in pose_errors(scene, target).values():
+    for error in pose_errors(exact, target).values():
         assert np.abs(error[3:]).max() < 5e-4
         assert np.abs(error[:3]).max() < 5e-6
     target, _ = labels_only.calibrate(scene, 0.01, 4)

@@ -328,7 +328,8 @@ FLOAT_MM = 1e-4
 @pytest.fixture(scope="module")
 def files(small_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
-    return {name: export_run(small_run, folder / f"box{form.suffix}", name="box").path for name, form in FORMS.items()}
+    made = {name: export_run(small_run, folder / f"box{form.suffix}", name="box").path for name, form in FORMS.items()}
+    return made | {"told": export_run(small_run, folder / "box.txt", "tf2", "box").path}
 
 
 @pytest.fixture(scope="module")
@@ -384,7 +385,9 @@ def test_xacro(files, faces, tmp_path):
         require_frames(statics, faces)
 
 
-@pytest.mark.parametrize(("form", "read"), [("tf2", read_messages), ("ros2", read_ros2_launch)])
+@pytest.mark.parametrize(
+    ("form", "read"), [("tf2", read_messages), ("told", read_messages), ("ros2", read_ros2_launch)]
+)
 def test_ros(files, faces, form, read):
     require_frames(read(files[form].read_text(encoding="utf-8")), faces)
 
