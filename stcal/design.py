@@ -39,32 +39,23 @@ class FaceDesign(Brief):
 
     Parameters
     ----------
-    id : str
-        Name of the face.
-    ids : tuple of str
-        Names of its n circles, which neither occur twice nor overlap.
-    xy_mm : (n, 2) array
-        Centres, face frame, mm.
-    radius_mm : (n,) array
-        Radii, mm.
-    origin, x, y : str
-        Circles that define the frame.
+    id : Name of the face.
+    ids : Names of its n circles, which neither occur twice nor overlap.
+    xy_mm : (n, 2) array. Centres, face frame, mm.
+    radius_mm : (n,) array. Radii, mm.
+    origin, x, y : Circles that define the frame.
     rough_target_from_face : Rigid, optional
         Approximate pose in a frame that all faces share, for plans and simulations; a calibration does not use it.
-    outline_mm : (k, 2) array, optional
-        Corners of its plate in order, face frame, for drawings.
+    outline_mm : (k, 2) array. Corners of its plate in order, face frame, for drawings.
     rim_mm : (n,) array, optional
         Heights of the rims in front of the circles, negative for discs that stand out; None if they lie in the surface.
-    printed : PrintedPattern, optional
-        The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
-        is the face frame, Z into the body; None for a face of circles.
-    sigma_mm : float, optional
-        σ of a point's place in the plane about the design if the design is what the face was made by, as print is; None
-        if the design only names the points.
+    printed : The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose
+        frame is the face frame, Z into the body; None for a face of circles.
+    sigma_mm : σ of a point's place in the plane about the design if the design is what the face was made by, as print
+        is; None if the design only names the points.
     size_sigma, edge_share : float
         Relative σ of the printed size, and the share of its variance that is due to the edges of tags.
-    of_tags : bool
-        Whether the corners are those of tags, four by four, whose edges light and ink move.
+    of_tags : Whether the corners are those of tags, four by four, whose edges light and ink move.
     """
 
     id: str
@@ -157,16 +148,11 @@ class TargetDesign(Brief):
 
     Parameters
     ----------
-    name : str
-        For messages and reports.
-    polarity : {"bright", "dark"}
-        Of the circles against their surroundings.
-    faces : tuple of FaceDesign
-        The first one is the reference face.
-    unusual_size : bool
-        True if unusually large or small radii are not a mistake of units.
-    distances : tuple of KnownDistance
-        Known distances between its points.
+    name : For messages and reports.
+    polarity : Of the circles against their surroundings.
+    faces : The first one is the reference face.
+    unusual_size : True if unusually large or small radii are not a mistake of units.
+    distances : Known distances between its points.
     """
 
     name: str
@@ -272,26 +258,16 @@ class BoardDesign(ByValue):
 
     Parameters
     ----------
-    rows, columns : int
-        Numbers of dots down and across.
-    pitch_mm, radius_mm : float
-        Distance of neighbouring dots, and their radius, mm.
-    polarity : {"bright", "dark"}
-        Of the dots against the board.
-    sigma_mm : float
-        Standard deviation of the dots' positions about the grid, per axis, mm.
-    corner : (int, int), optional
-        Row and column of the one larger dot; None for a plain board.
-    corner_radius_mm : float, optional
-        Radius of the larger dot, mm.
-    stated : StatedSize
-        What is stated about its size, in addition to the drawing.
-    unusual_size : bool
-        True if an unusually large or small pitch or radius is not a mistake of units.
-    rim_mm : float
-        Height of the rims in front of the dots, negative for dots that stand out; mm.
-    rings : tuple of (int, int)
-        Row and column of each dot with a hole, which tell the board from its turns.
+    rows, columns : Numbers of dots down and across.
+    pitch_mm, radius_mm : Distance of neighbouring dots, and their radius, mm.
+    polarity : Of the dots against the board.
+    sigma_mm : Standard deviation of the dots' positions about the grid, per axis, mm.
+    corner : (int, int). Row and column of the one larger dot; None for a plain board.
+    corner_radius_mm : Radius of the larger dot, mm.
+    stated : What is stated about its size, in addition to the drawing.
+    unusual_size : True if an unusually large or small pitch or radius is not a mistake of units.
+    rim_mm : Height of the rims in front of the dots, negative for dots that stand out; mm.
+    rings : tuple of (int, int). Row and column of each dot with a hole, which tell the board from its turns.
     """
 
     rows: int

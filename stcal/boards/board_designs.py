@@ -116,14 +116,10 @@ class TagLayout(Distinct, Brief):
 
     Parameters
     ----------
-    tags : tuple of (str, int)
-        Dictionary and id of each of the n tags.
-    corners_mm : (n, 4, 2) array
-        Top left, top right, bottom right and bottom left corner as printed, mm.
-    sigma_mm : float
-        σ of a corner's coordinate.
-    unusual_size : bool
-        True if unusually long or short sides are not a mistake of units.
+    tags : tuple of (str, int). Dictionary and id of each of the n tags.
+    corners_mm : (n, 4, 2) array. Top left, top right, bottom right and bottom left corner as printed, mm.
+    sigma_mm : σ of a corner's coordinate.
+    unusual_size : True if unusually long or short sides are not a mistake of units.
 
     Raises InputError: tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that
     are not mm.
@@ -154,18 +150,12 @@ class TagLayout(Distinct, Brief):
 
         Parameters
         ----------
-        dictionary : str
-            Name in ``cv2.aruco``, with or without ``DICT_``: ``"4X4_50"``.
-        ids : sequence of int
-            Ids of the n tags.
-        xy_mm : (n, 2) array
-            Middles of the tags, mm; X to the right and Y down on the printed sheet.
-        size_mm : float or (n,) array
-            Outer sides of the black borders, mm.
-        angle_deg : float or (n,) array
-            Angles by which the tags are turned, from X to Y.
-        sigma_mm : float
-            σ of a corner's coordinate, mm.
+        dictionary : Name in ``cv2.aruco``, with or without ``DICT_``: ``"4X4_50"``.
+        ids : Ids of the n tags.
+        xy_mm : (n, 2) array. Middles of the tags, mm; X to the right and Y down on the printed sheet.
+        size_mm : float or (n,) array. Outer sides of the black borders, mm.
+        angle_deg : float or (n,) array. Angles by which the tags are turned, from X to Y.
+        sigma_mm : σ of a corner's coordinate, mm.
 
         Raises InputError: a value is not finite, a size is not positive, or a tag is unknown or occurs twice.
         """

@@ -366,8 +366,7 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 
     Parameters
     ----------
-    path : str or Path
-        The file: TOML, or Kalibr's YAML.
+    path : The file: TOML, or Kalibr's YAML.
 
     Raises InputError: the file is unreadable, invalid for its kind, or of several boards; the message names file, place
     and reason.
@@ -390,8 +389,7 @@ def load_board(path: str | Path) -> BoardDesign:
 
     Parameters
     ----------
-    path : str or Path
-        ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
+    path : ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
 
     Raises InputError: as :func:`load_flat_board`; or its circles have no radius.
     """
@@ -492,10 +490,8 @@ def save_board(path: str | Path, board: BoardDesign) -> None:
 
     Parameters
     ----------
-    path : str or Path
-        ``board.toml`` to write.
-    board : BoardDesign
-        Board of dots, or of the kinds that :func:`load_board` makes boards of dots of.
+    path : ``board.toml`` to write.
+    board : Board of dots, or of the kinds that :func:`load_board` makes boards of dots of.
     """
     text = board_toml(board)
     save(Path(path), text)

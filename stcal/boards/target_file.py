@@ -134,10 +134,8 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
 
     Parameters
     ----------
-    path : str or Path
-        The file (form: ``data_layout.md``).
-    printed : bool
-        False if faces with a board or tags are to be refused.
+    path : The file (form: ``data_layout.md``).
+    printed : False if faces with a board or tags are to be refused.
 
     Raises InputError: the file cannot be read or is no design, or has a tag on two faces; the message names file, place
     and reason.
@@ -395,10 +393,8 @@ def save_target(path: str | Path, target: TargetDesign) -> None:
 
     Parameters
     ----------
-    path : str or Path
-        ``target.toml`` to write.
-    target : TargetDesign
-        Faces of circles, boards and tags.
+    path : ``target.toml`` to write.
+    target : Faces of circles, boards and tags.
     """
     text = target_toml(target)
     save(Path(path), text)

@@ -396,17 +396,12 @@ def draw(
 
     Parameters
     ----------
-    design : TargetDesign, board of any kind, or path
-        The design, or its ``target.toml`` or board file.
-    out : str or Path
-        File of the drawing; an earlier one is replaced.
-    paper : str
-        ``A5`` … ``A0``, ``Letter``, ``Legal``, ``Tabloid``, or ``own`` for pages as large as their content; if empty,
-        ``own`` for SVG, and for PDF A4, or the smallest that takes a net on one sheet.
-    margin_mm : float
-        Distance from the outermost circles to the edge of a plate without an outline, mm.
-    net : bool
-        Whether the plates of a target are unfolded into one net on one sheet, by their outlines and rough poses.
+    design : The design, or its ``target.toml`` or board file.
+    out : File of the drawing; an earlier one is replaced.
+    paper : ``A5`` … ``A0``, ``Letter``, ``Legal``, ``Tabloid``, or ``own`` for pages as large as their content; if
+        empty, ``own`` for SVG, and for PDF A4, or the smallest that takes a net on one sheet.
+    margin_mm : Distance from the outermost circles to the edge of a plate without an outline, mm.
+    net : Whether the plates of a target are unfolded into one net on one sheet, by their outlines and rough poses.
 
     Raises
     ------

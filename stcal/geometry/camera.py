@@ -52,18 +52,13 @@ class Camera(ByValue):
 
     Parameters
     ----------
-    width, height : int
-        Image size, px.
-    focal, centre : (2,) array
-        fx, fy and cx, cy, px, centre of the top-left pixel at (0, 0).
-    distortion : (12,) array
-        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
-    fisheye : bool
-        True for equidistant projection; k5, k6, s2 and s4 must then be 0.
+    width, height : Image size, px.
+    focal, centre : (2,) array. fx, fy and cx, cy, px, centre of the top-left pixel at (0, 0).
+    distortion : (12,) array. k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
+    fisheye : True for equidistant projection; k5, k6, s2 and s4 must then be 0.
     colmap_model : str, optional
         The COLMAP model that represents the camera exactly; the most general one of its projection if not given.
-    covariance : (q, q) array, optional
-        Covariance of the parameters of ``colmap_model``, in its order; None if unknown.
+    covariance : (q, q) array. Covariance of the parameters of ``colmap_model``, in its order; None if unknown.
     """
 
     width: int
@@ -112,13 +107,10 @@ class Camera(ByValue):
 
         Parameters
         ----------
-        matrix : (3, 3) array
-            ``cameraMatrix``: fx, fy, cx, cy, px; without skew.
-        distortion : (k,) array
-            k1, k2, p1, p2, k3, k4, k5, k6, all or the first 4 or 5; none for a lens without distortion. With
-            ``fisheye``, the equidistant projection of ``cv2.fisheye``, its k1, k2, k3, k4.
-        size : (int, int)
-            Width and height of the images, px.
+        matrix : (3, 3) array. ``cameraMatrix``: fx, fy, cx, cy, px; without skew.
+        distortion : (k,) array. k1, k2, p1, p2, k3, k4, k5, k6, all or the first 4 or 5; none for a lens without
+            distortion. With ``fisheye``, the equidistant projection of ``cv2.fisheye``, its k1, k2, k3, k4.
+        size : (int, int). Width and height of the images, px.
         """
         k = frozen(matrix, (3, 3), "camera matrix")
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:

@@ -128,8 +128,7 @@ class Rigid(ByValue, _Frames):
     ----------
     rotation : (3, 3) array or Rotation
         A proper rotation; checked to 1e-6, then projected onto SO(3). SciPy's rotations are taken too.
-    translation : (3,) array
-        Origin of b in a, mm.
+    translation : (3,) array. Origin of b in a, mm.
     """
 
     rotation: Turn = field(default_factory=lambda: cast(Any, np.eye(3)))
@@ -248,10 +247,8 @@ class Poses(Brief, _Frames):
 
     Parameters
     ----------
-    rotation : (m, 3, 3) array
-        Proper rotations, to 1e-6.
-    translation : (m, 3) array
-        Origins of b in a, mm.
+    rotation : (m, 3, 3) array. Proper rotations, to 1e-6.
+    translation : (m, 3) array. Origins of b in a, mm.
     """
 
     rotation: Array

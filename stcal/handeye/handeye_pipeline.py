@@ -364,8 +364,7 @@ def handeye(
 
     Returns
     -------
-    HandEye
-        X and Z with covariances, residuals, outliers, notes on anything doubtful, and the verdict.
+    HandEye : X and Z with covariances, residuals, outliers, notes on anything doubtful, and the verdict.
 
     Raises InputError: the method or setup is unknown, ``reprojection`` has no views, or the poses follow another
     convention. Raises DegenerateError: the poses do not determine the answer; the message says which motion is missing.

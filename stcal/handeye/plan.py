@@ -255,8 +255,7 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
 
     Returns
     -------
-    str
-        CSV with base_from_flange and camera_from_board, mm (form: ``data_layout.md``).
+    str : CSV with base_from_flange and camera_from_board, mm (form: ``data_layout.md``).
     """
     joints = joints or {}
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}

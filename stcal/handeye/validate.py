@@ -150,8 +150,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
 
     Returns
     -------
-    (repeats, k) int array
-        Rows held out in each split, in ascending order.
+    (repeats, k) int array : Rows held out in each split, in ascending order.
 
     Raises InputError: fewer than three poses would remain.
     """
@@ -306,8 +305,7 @@ def compare(
 
     Returns
     -------
-    tuple of Compared
-        One per method, in the order of ``methods``; a method that fails has a reason.
+    tuple of Compared : One per method, in the order of ``methods``; a method that fails has a reason.
 
     Raises InputError: the poses follow another convention. Raises DegenerateError: no method can solve these poses.
     """
@@ -388,8 +386,7 @@ def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
 
     Returns
     -------
-    (k, 2) array
-        Angle of the difference, rad; distance of the translations, mm.
+    (k, 2) array : Angle of the difference, rad; distance of the translations, mm.
     """
     difference = (mount_from_camera @ motions.camera @ mount_from_camera.inverse()).difference(motions.mount)
     return np.column_stack([np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)])

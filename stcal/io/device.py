@@ -54,10 +54,8 @@ class OpenCVSource:
 
     Parameters
     ----------
-    device : str
-        Its number, or a path such as ``/dev/video0``.
-    gain : float, optional
-        Gain in the driver's unit; unchanged if None.
+    device : Its number, or a path such as ``/dev/video0``.
+    gain : Gain in the driver's unit; unchanged if None.
     """
 
     def __init__(self, device: str, gain: float | None = None):
@@ -99,10 +97,8 @@ class SimulatedSource:
     Parameters
     ----------
     image : str or Path
-    gain : float, optional
-        Factor on the brightness; 1 if None.
-    seed : int
-        Seed of the noise.
+    gain : Factor on the brightness; 1 if None.
+    seed : Seed of the noise.
     """
 
     def __init__(self, image: str | Path, gain: float | None = None, seed: int = 0):

@@ -22,10 +22,8 @@ class JoinedTable(ByValue):
 
     Parameters
     ----------
-    table : Table
-        Rows that both have, for any function that reads a table.
-    notes : tuple of str
-        On the rows that occur in only one of them.
+    table : Rows that both have, for any function that reads a table.
+    notes : On the rows that occur in only one of them.
     """
 
     table: Table
@@ -41,8 +39,7 @@ def load_table(path: str | Path, quaternions: Order = "wxyz", what: str = "table
     path : str or Path
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    what : str
-        What the file holds, for messages.
+    what : What the file holds, for messages.
 
     Raises InputError: the file is no table, a column is missing, or a row has another length.
     """
@@ -61,16 +58,12 @@ def join_tables(
 
     Parameters
     ----------
-    a, b : str, Path or Table
-        Tables with a column ``key`` that holds each value once.
-    key : str
-        Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
-    prefixes : (str, str)
-        Prefix for the columns of a pose or a position in each table, ``x_mm`` to ``qz`` and covariances: ``("a", "b")``
-        for a registration, ``("commanded_", "")`` to verify a robot. Other columns keep their names; of two of one
-        name, that of ``a`` is used.
-    quaternions : {"wxyz", "xyzw"}
-        As of :func:`load_table`.
+    a, b : Tables with a column ``key`` that holds each value once.
+    key : Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
+    prefixes : (str, str). Prefix for the columns of a pose or a position in each table, ``x_mm`` to ``qz`` and
+        covariances: ``("a", "b")`` for a registration, ``("commanded_", "")`` to verify a robot. Other columns keep
+        their names; of two of one name, that of ``a`` is used.
+    quaternions : As of :func:`load_table`.
 
     Raises InputError: a file is no table or lacks the key column, a key occurs twice, no key is common to both, or both
     files have the same pose column.
@@ -116,12 +109,9 @@ def stack_tables(
     Parameters
     ----------
     tables : sequence of Table
-    names : sequence of str
-        Different names of the tables, written into the new column.
-    called : dict of str, optional
-        Second names of some columns, by which copies of these are added: ``{"pose": "image"}``.
-    column : str
-        Name of the new column.
+    names : Different names of the tables, written into the new column.
+    called : Second names of some columns, by which copies of these are added: ``{"pose": "image"}``.
+    column : Name of the new column.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -36,18 +36,12 @@ class Table(ByValue):
 
     Parameters
     ----------
-    where : str
-        Name of the file, for messages.
-    columns : dict of list of str or (m,) array
-        Cells by the name of the column, which holds the unit.
-    lines : sequence of m int
-        Line number of each row in the file, from 1.
-    quaternions : {"wxyz", "xyzw"}
-        Order of quaternion components.
-    rows : sequence of m str
-        Text of the lines if all columns are numbers, since a name such as 01 must be kept.
-    form : str
-        Form in words, if it is not that of the package: ``; between columns, decimal commas``.
+    where : Name of the file, for messages.
+    columns : dict of list of str or (m,) array. Cells by the name of the column, which holds the unit.
+    lines : Line number of each row in the file, from 1.
+    quaternions : Order of quaternion components.
+    rows : Text of the lines if all columns are numbers, since a name such as 01 must be kept.
+    form : Form in words, if it is not that of the package: ``; between columns, decimal commas``.
     """
 
     where: str

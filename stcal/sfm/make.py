@@ -213,24 +213,15 @@ class DesignOptions(Brief):
 
     Parameters
     ----------
-    size_mm : tuple of float
-        Width, height and depth of the box, mm.
-    circles : int
-        Number of circles on each face.
-    radius_mm : float, optional
-        Radius of the smaller circles, mm; one that suits box and camera if None.
-    distance_mm : float
-        Distance of the cameras from the target, mm.
-    width : int
-        Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
-    camera : Camera, optional
-        Camera, whose file must state the image size.
-    polarity : {"dark", "bright"}
-        Dark circles on bright plates, or the reverse.
-    seed : int
-        Seed of the random pattern.
-    faces : tuple of str
-        Sides with circles, of ``front``, ``right``, ``back``, ``left`` and ``top``; the reference face first.
+    size_mm : Width, height and depth of the box, mm.
+    circles : Number of circles on each face.
+    radius_mm : Radius of the smaller circles, mm; one that suits box and camera if None.
+    distance_mm : Distance of the cameras from the target, mm.
+    width : Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
+    camera : Camera, whose file must state the image size.
+    polarity : Dark circles on bright plates, or the reverse.
+    seed : Seed of the random pattern.
+    faces : Sides with circles, of ``front``, ``right``, ``back``, ``left`` and ``top``; the reference face first.
 
     Raises
     ------
@@ -374,20 +365,15 @@ def design_target(
 
     Parameters
     ----------
-    options : DesignOptions
-        Box, circles and camera.
-    images : int
-        Number of images of each group in the forecast.
-    out : str or Path, optional
-        Folder for ``target.toml`` and ``board.toml``. A ``board.toml`` that is there is kept, and forecast with.
+    options : Box, circles and camera.
+    images : Number of images of each group in the forecast.
+    out : Folder for ``target.toml`` and ``board.toml``. A ``board.toml`` that is there is kept, and forecast with.
         Nothing is written if None.
-    progress : callable, optional
-        Called with (stage, done, total).
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    DesignedTarget
-        ``target`` and ``board``, mm; ``forecast`` with the σ to expect of every face, mm and rad.
+    DesignedTarget : ``target`` and ``board``, mm; ``forecast`` with the σ to expect of every face, mm and rad.
 
     Raises
     ------
@@ -421,26 +407,18 @@ def design_tag_body(
 
     Parameters
     ----------
-    kind : {"cube", "dodecahedron"}
-        The body.
-    size_mm : float
-        Width between opposite faces, mm.
-    dictionary : str
-        Dictionary of the tags.
-    first_id : int
-        Id of the first tag, from which they count up.
-    session : PlanOptions, optional
-        Photographs of the forecast: ``images``, ``distance_mm``, ``width`` or ``camera``, and ``seed``.
-    out : str or Path, optional
-        Folder for ``target.toml``; nothing is written if None.
-    faces : str
-        Ids of the faces with a tag, such as ``1,2,3,4,5``; all of them if empty.
+    kind : The body.
+    size_mm : Width between opposite faces, mm.
+    dictionary : Dictionary of the tags.
+    first_id : Id of the first tag, from which they count up.
+    session : Photographs of the forecast: ``images``, ``distance_mm``, ``width`` or ``camera``, and ``seed``.
+    out : Folder for ``target.toml``; nothing is written if None.
+    faces : Ids of the faces with a tag, such as ``1,2,3,4,5``; all of them if empty.
 
     Returns
     -------
-    DesignedTarget
-        ``target``, mm; ``forecast`` with the σ to expect of every face, mm and rad, or the ``reason`` why there is
-        none.
+    DesignedTarget : ``target``, mm; ``forecast`` with the σ to expect of every face, mm and rad, or the ``reason`` why
+        there is none.
 
     Raises
     ------

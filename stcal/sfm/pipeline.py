@@ -95,8 +95,7 @@ def run(
 
     Returns
     -------
-    RunResult
-        ``target`` is the calibrated target. All results are in the folder, too.
+    RunResult : ``target`` is the calibrated target. All results are in the folder, too.
 
     Raises
     ------
@@ -329,8 +328,7 @@ def detect_images(
 
     Returns
     -------
-    DetectedImages
-        ``images`` has the labelled circles by name of the image, px; ``notes`` what was left out.
+    DetectedImages : ``images`` has the labelled circles by name of the image, px; ``notes`` what was left out.
 
     Raises
     ------

@@ -41,18 +41,12 @@ class BodyOptions:
 
     Parameters
     ----------
-    images : int
-        Number of photographs.
-    distance_mm, depth_share : float
-        Distance of the camera from the middle of the body, mm, to ± this share of it.
-    noise : float
-        Standard deviation of the sensor noise, fraction of full scale.
-    blur_px : float
-        Sigma of the Gaussian point spread function, px.
-    seed : int
-        Seed of everything random.
-    pose_sigma_mm, pose_sigma_deg : float
-        σ of the faces about their rough poses, mm and degrees.
+    images : Number of photographs.
+    distance_mm, depth_share : Distance of the camera from the middle of the body, mm, to ± this share of it.
+    noise : Standard deviation of the sensor noise, fraction of full scale.
+    blur_px : Sigma of the Gaussian point spread function, px.
+    seed : Seed of everything random.
+    pose_sigma_mm, pose_sigma_deg : σ of the faces about their rough poses, mm and degrees.
     print_errors : float
         Factor on the σ that the design states of printed faces, and on the bends of :data:`BEND_MM`; 0 for exact ones.
     body_seed : int, optional
@@ -131,8 +125,7 @@ def body_camera(width: int) -> Camera:
 
     Parameters
     ----------
-    width : int
-        Width of its images, px.
+    width : Width of its images, px.
     """
     height, distortion = round(width * 2 / 3), [-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0]
     centre = width / 2 + 0.006 * width, height / 2 - 0.004 * width
@@ -149,12 +142,9 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
 
     Parameters
     ----------
-    target : TargetDesign
-        Design of the body, with a rough pose of each face, mm.
-    camera : Camera
-        The camera before which it is held, such as :func:`stcal.synthetic.body_camera` returns.
-    options : BodyOptions, optional
-        The defaults if None.
+    target : Design of the body, with a rough pose of each face, mm.
+    camera : The camera before which it is held, such as :func:`stcal.synthetic.body_camera` returns.
+    options : The defaults if None.
 
     Raises InputError: a face has no rough pose, or the camera is too near for the image to hold the body.
     """

@@ -137,12 +137,9 @@ def render_all(
 
     Parameters
     ----------
-    scene : Scene
-        Target, board, camera and views.
-    options : RenderOptions, optional
-        Appearance of the photographs; the defaults if None.
-    workers : int, optional
-        Number of processes that render; one per core by default.
+    scene : Target, board, camera and views.
+    options : Appearance of the photographs; the defaults if None.
+    workers : Number of processes that render; one per core by default.
 
     Raises InputError: the lens does not fit the scene.
     """
@@ -188,15 +185,11 @@ def write_dataset(
 
     Parameters
     ----------
-    folder : path
-        Folder of the data set, new or empty.
-    scene : Scene or BodyScene
-        Target, board, camera and views; or a body with its photographs.
-    render_options : RenderOptions, optional
-        Appearance of the photographs; the defaults if None. That of a body is in its own options.
+    folder : Folder of the data set, new or empty.
+    scene : Target, board, camera and views; or a body with its photographs.
+    render_options : Appearance of the photographs; the defaults if None. That of a body is in its own options.
     image_format, jpeg_quality : {"jpg", "png"}, int
-    workers, progress : int, callable, optional
-        Number of processes, one per core by default; called with (done, total).
+    workers, progress : Number of processes, one per core by default; called with (done, total).
 
     Raises InputError: the folder is not empty or cannot be written, or the image format or the lens does not fit.
     """

@@ -35,12 +35,9 @@ class ThinLens:
 
     Parameters
     ----------
-    f_number : float
-        Focal length / diameter of the aperture, N.
-    focal_mm : float
-        Focal length, f.
-    focus_mm : float
-        Depth of the plane of focus from the camera's centre, z_f.
+    f_number : Focal length / diameter of the aperture, N.
+    focal_mm : Focal length, f.
+    focus_mm : Depth of the plane of focus from the camera's centre, z_f.
     """
 
     f_number: float

@@ -217,38 +217,25 @@ class RenderOptions:
 
     Parameters
     ----------
-    noise : float
-        Standard deviation of the sensor noise, fraction of full scale.
-    blur_px : float
-        Sigma of the Gaussian point spread function.
-    vignetting : float
-        Loss of light in the corners, fraction.
+    noise : Standard deviation of the sensor noise, fraction of full scale.
+    blur_px : Sigma of the Gaussian point spread function.
+    vignetting : Loss of light in the corners, fraction.
     gradient : float
         Linear variation of brightness by ± this fraction from one side of the image to the other, in random direction.
-    spread : float
-        Standard deviation of the brightness of single circles, fraction.
-    exposure : float
-        Factor on all brightness. Circles saturate above 1.4 on a bright design; the default stays clear of it.
-    clutter : bool
-        Whether there are a checkered wall with discs and ellipses, and reflections; else a plain wall.
-    reflectance : float, optional
-        Reflectance of a table below target and board, which shows all of them as a mirror does. Clutter has a table
-        that shows their circles faintly.
-    bit_depth : int
-        8 or 16.
-    seed : int
-        Seed of noise and scenery, in addition to the seed of the scene.
-    lens : ThinLens, optional
-        Aperture and focus; without it everything is in focus. It needs a perspective camera.
-    rim_mm : float
-        Depth of the luminous discs of the faces behind rims of the same radius, cylindrical holes: what is seen is the
-        part of a disc that a camera sees through the hole's upper edge. A negative value raises the disc by that
+    spread : Standard deviation of the brightness of single circles, fraction.
+    exposure : Factor on all brightness. Circles saturate above 1.4 on a bright design; the default stays clear of it.
+    clutter : Whether there are a checkered wall with discs and ellipses, and reflections; else a plain wall.
+    reflectance : Reflectance of a table below target and board, which shows all of them as a mirror does. Clutter has a
+        table that shows their circles faintly.
+    bit_depth : 8 or 16.
+    seed : Seed of noise and scenery, in addition to the seed of the scene.
+    lens : Aperture and focus; without it everything is in focus. It needs a perspective camera.
+    rim_mm : Depth of the luminous discs of the faces behind rims of the same radius, cylindrical holes: what is seen is
+        the part of a disc that a camera sees through the hole's upper edge. A negative value raises the disc by that
         height: its top shines, its wall is dark, and the circle simply lies higher. The stated true circles stay where
         the face is. Dots of the board have the rims that its design states.
-    slope : float
-        Fraction by which the light of each disc of the faces rises from one side to the other, along x of its face.
-    fade : float
-        Fraction of its light that each disc of the faces lacks at its edge; the loss grows with the squared radius.
+    slope : Fraction by which the light of each disc of the faces rises from one side to the other, along x of its face.
+    fade : Fraction of its light that each disc of the faces lacks at its edge; the loss grows with the squared radius.
     """
 
     noise: float = 0.01

@@ -36,35 +36,23 @@ class SceneOptions:
     Parameters
     ----------
     seed : int
-    width, height : int
-        Image size, px.
-    focal_px : float, optional
-        Focal length; by default that of a 24 mm lens on a 22.3 mm wide sensor.
-    distortion : tuple of up to 8 floats
-        k1, k2, p1, p2, k3, k4, k5, k6.
-    centre_sigma : float
-        Standard deviation of the principal point about the middle of the image, in image widths.
-    distance_mm : float
-        Distance from the camera to target and board; varies by ±10 %.
-    spread_deg : float
-        Angle by which the views spread to every side, as far as both faces stay visible.
+    width, height : Image size, px.
+    focal_px : Focal length; by default that of a 24 mm lens on a 22.3 mm wide sensor.
+    distortion : k1, k2, p1, p2, k3, k4, k5, k6.
+    centre_sigma : Standard deviation of the principal point about the middle of the image, in image widths.
+    distance_mm : Distance from the camera to target and board; varies by ±10 %.
+    spread_deg : Angle by which the views spread to every side, as far as both faces stay visible.
     images_per_group : int
-    groups : tuple of pairs of face ids, optional
-        By default the groups of the paper for the reference design, else all pairs that can be seen together.
+    groups : By default the groups of the paper for the reference design, else all pairs that can be seen together.
     circle_sigma_mm : float
         σ of the in-plane placement of the target's circles, per axis. That of the board's dots is in its design.
-    face_shift_mm, face_turn_deg : float
-        RMS length and angle of the deviations of true face poses from nominal ones.
-    margin_mm : float
-        How far plates without ``outline_mm`` reach beyond the rims of their circles.
-    one_board : bool
-        Whether all groups show the same board, whose dots err alike; otherwise each has a board of its own.
-    fisheye_deg : float, optional
-        Field of an equidistant lens over the image's diagonal, 60° to 170°, that is not centred on the target. It has
-        a focal length and distortion of its own. By default the lens is perspective.
-    body_seed : int, optional
-        Draws the errors of target, camera and ``one_board``, so that another ``seed`` photographs the same ones again;
-        ``seed`` by default.
+    face_shift_mm, face_turn_deg : RMS length and angle of the deviations of true face poses from nominal ones.
+    margin_mm : How far plates without ``outline_mm`` reach beyond the rims of their circles.
+    one_board : Whether all groups show the same board, whose dots err alike; otherwise each has a board of its own.
+    fisheye_deg : Field of an equidistant lens over the image's diagonal, 60° to 170°, that is not centred on the
+        target. It has a focal length and distortion of its own. By default the lens is perspective.
+    body_seed : Draws the errors of target, camera and ``one_board``, so that another ``seed`` photographs the same ones
+        again; ``seed`` by default.
     """
 
     seed: int = 0
@@ -121,16 +109,12 @@ class Scene(Brief):
 
     Parameters
     ----------
-    target, board, camera : TargetDesign, BoardDesign, Camera
-        Designs of what is photographed, and the camera as it really is.
+    target, board, camera : Designs of what is photographed, and the camera as it really is.
     target_from_face : dict of Rigid
         Three-point frames through the circles as really placed, by face id; that of the first face is the target frame.
-    circles_target : dict of (3,) array
-        Centres of the circles as really placed, by label, target frame, mm.
-    groups : dict of Group
-        Board and views of each group, by name.
-    seed, margin_mm : int, float
-        As in the options.
+    circles_target : dict of (3,) array. Centres of the circles as really placed, by label, target frame, mm.
+    groups : Board and views of each group, by name.
+    seed, margin_mm : As in the options.
     """
 
     target: TargetDesign
@@ -192,12 +176,9 @@ def make_scene(
 
     Parameters
     ----------
-    options, target, board : optional
-        Options, and designs of target and board; the defaults and the reference designs if None.
-    nominal : dict of Rigid, optional
-        Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
-    camera : Camera, optional
-        The camera, in place of the one that the options describe.
+    options, target, board : Options, and designs of target and board; the defaults and the reference designs if None.
+    nominal : Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
+    camera : The camera, in place of the one that the options describe.
 
     Raises InputError: a group names an unknown face, a nominal pose is missing, or the camera states no image size or
     is given beside ``fisheye_deg``.

@@ -88,8 +88,7 @@ def read_handeye(
 
     Returns
     -------
-    HandEyeInput
-        ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
+    HandEyeInput : ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
         :func:`stcal.workflows.calibrate_handeye` and :func:`stcal.workflows.plan_handeye`.
 
     Raises InputError: A file is missing or not of the required form, one file too many was given, or no image shows the

@@ -219,8 +219,7 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
     Returns
     -------
-    Planned
-        ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
+    Planned : ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
 
     Raises InputError: for the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of
     the poses taken. Raises DegenerateError: for the reasons given in :func:`stcal.handeye.handeye`.
@@ -272,8 +271,7 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
 
     Returns
     -------
-    HandEyeInput, str
-        The input, and a sentence that names the poses.
+    HandEyeInput, str : The input, and a sentence that names the poses.
 
     Raises InputError: the input consists of images, which determine the poses by themselves.
     """

@@ -303,8 +303,7 @@ def read_poses(path: str | Path, quaternions: Order = "wxyz") -> HandEyePoses:
 
     Returns
     -------
-    HandEyePoses
-        Poses in mm; pairs of a table are named by their lines.
+    HandEyePoses : Poses in mm; pairs of a table are named by their lines.
 
     Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
     line; copied poses.

@@ -94,10 +94,8 @@ class CameraPrior(ByValue):
 
     Parameters
     ----------
-    colmap_model : str
-        COLMAP's name of the lens's model.
-    covariance : (q, q) array
-        Covariance of the model's parameters, in its order.
+    colmap_model : COLMAP's name of the lens's model.
+    covariance : (q, q) array. Covariance of the model's parameters, in its order.
     """
 
     colmap_model: str
@@ -121,8 +119,7 @@ def camera_prior(camera: Camera) -> CameraPrior:
 
     Parameters
     ----------
-    camera : Camera
-        From :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
+    camera : From :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
     """
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)

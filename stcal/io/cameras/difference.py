@@ -81,8 +81,7 @@ def compare_cameras(one: Camera | FittedLens, two: Camera | FittedLens) -> Camer
 
     Parameters
     ----------
-    one, two : Camera
-        Cameras of the same image size. Of a lens with a region only this is compared.
+    one, two : Cameras of the same image size. Of a lens with a region only this is compared.
 
     Raises DegenerateError: too few pixels have a ray in both cameras.
     """
@@ -170,12 +169,9 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
 
     Parameters
     ----------
-    path : str or Path
-        Camera file as of :func:`stcal.load_camera`, of any model, or a photograph.
-    name : str
-        Name of the camera in a file of several, such as ``cam1``.
-    size : (int, int), optional
-        Width and height of the images, px, for a file that does not state them.
+    path : Camera file as of :func:`stcal.load_camera`, of any model, or a photograph.
+    name : Name of the camera in a file of several, such as ``cam1``.
+    size : (int, int). Width and height of the images, px, for a file that does not state them.
 
     Raises InputError: the file is missing or malformed, holds more than one camera, or no size is known.
     Raises ConvergenceError, DegenerateError: no supported model comes near the lens.

@@ -319,13 +319,10 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
 
     Parameters
     ----------
-    path : str or Path
-        File of COLMAP, OpenCV, ROS, Kalibr, EuRoC, MATLAB, Bouguet, Metashape, mrcal or camodocal
+    path : File of COLMAP, OpenCV, ROS, Kalibr, EuRoC, MATLAB, Bouguet, Metashape, mrcal or camodocal
         (``data_layout.md``).
-    name : str
-        Name of the camera in a file of several, such as ``cam1``.
-    size : (int, int), optional
-        Width and height of the images, px, for a file that does not state them.
+    name : Name of the camera in a file of several, such as ``cam1``.
+    size : (int, int). Width and height of the images, px, for a file that does not state them.
 
     Raises InputError: no such file, a malformed one, one of several cameras or an unsupported lens, or no size.
     """
@@ -417,15 +414,11 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
 
     Parameters
     ----------
-    path : str or Path
-        File to write; it is required to be read as the same camera.
-    camera : Camera
-        Camera to save, with its covariance if it has one.
-    form : str, optional
-        ``colmap``, ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``metashape`` …; if None, that of the suffix: ``.txt``
-        colmap, ``.yaml`` opencv, ``.cameramodel`` mrcal, ``.xml`` metashape, ``.mat`` matlab.
-    name : str
-        Name of the camera, for forms that have a place for it.
+    path : File to write; it is required to be read as the same camera.
+    camera : Camera to save, with its covariance if it has one.
+    form : ``colmap``, ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``metashape`` …; if None, that of the suffix:
+        ``.txt`` colmap, ``.yaml`` opencv, ``.cameramodel`` mrcal, ``.xml`` metashape, ``.mat`` matlab.
+    name : Name of the camera, for forms that have a place for it.
 
     Raises InputError: no form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
     """

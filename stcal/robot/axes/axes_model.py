@@ -53,6 +53,7 @@ MOVED_SHARE = 0.5
 """Share of the squared residuals beyond which a move along the order of the rows is named: gear errors vary with the
 order too."""
 FEW = 3  # largest number of outliers of a joint that are named
+ONE_LINE_MM = 10.0  # largest distance between axes that are meant to be one line, such as those of a SCARA's spindle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +198,7 @@ def robot_from_sweeps(
         robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
     slopes, rows = slopes_of(frames, nominal), 5 * len(frames)
     pairs = pairs_of(frames, slopes, covariance, nominal, sum(abs(row.a) + abs(row.d) for row in robot.rows))
-    notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot)]
+    notes = [*data.notes, *notes, *_remarks(measured, data, fits, robot, nominal)]
     notes += [
         f"joints {p.joint} and {p.joint + 1}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"
@@ -363,7 +364,9 @@ def _require_build(where: str, robot: Robot, nominal: Robot) -> None:
         raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
 
 
-def _remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot) -> list[str]:
+def _remarks(
+    measured: Measurements, data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot
+) -> list[str]:
     """Returns remarks on the axes, their robot, and moves between the rows ``measured``, ``data`` with virtual ones."""
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
@@ -388,6 +391,13 @@ def _remarks(measured: Measurements, data: Measurements, fits: list[AxisFit], ro
         what = called(name) if name else "rows without a target, beside rows with one"
         alone = "so that its place on the flange rests on these rows alone; name it like the others, or leave it out"
         notes.append(f"line {line}: {what}: on no arc of any joint ({count} rows), {alone}")
+    for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
+        after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
+        one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
+        if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
+            theta, drawn = np.degrees([row.theta, wanted.theta])
+            said = f"theta is {theta:.2f}°, {drawn:.2f}° in the robot file: its zero position differs"
+            notes.append(f"joint {i + 1}: {said}")
     moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(measured, "position"), MOVED_SHARE)
     return notes if moved is None else [*notes, moved.sentence()]
 

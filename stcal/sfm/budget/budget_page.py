@@ -179,23 +179,17 @@ def uncertainty_budget(
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    statement : str or Path, optional
-        File with temperatures, expansion, the σ of the board's pitch and fields of the head (TOML).
-    fields : dict of str, optional
-        Fields of the head by name, such as ``{"operator": "A. Smith"}``; they override those of ``statement``.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    statement : File with temperatures, expansion, the σ of the board's pitch and fields of the head (TOML).
+    fields : Fields of the head by name, such as ``{"operator": "A. Smith"}``; they override those of ``statement``.
     check_lengths : str or Path, optional
         File of lengths with which distances between circles are compared (CSV: from, to, length_mm, sigma_mm).
-    lengths : str, Path, SavedRun or RunResult, optional
-        A second calibration of the target, with which the longest distances are compared.
-    lengths_statement : str or Path, optional
-        What is stated of that run; ``statement`` if None.
+    lengths : A second calibration of the target, with which the longest distances are compared.
+    lengths_statement : What is stated of that run; ``statement`` if None.
 
     Returns
     -------
-    UncertaintyBudget
-        ``file`` has every figure with its unit; ``refusals`` say why the budget must not be used.
+    UncertaintyBudget : ``file`` has every figure with its unit; ``refusals`` say why the budget must not be used.
 
     Raises
     ------

@@ -187,14 +187,10 @@ def calibrate_models(
 
     Parameters
     ----------
-    model : str or Path
-        A COLMAP model, or the folder of several.
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    solve : {"chain", "paper"}
-        Every way to a face weighed; or as in Zhang & Wei (2017): λ by rows, three-point frames, single transforms.
-    out : str or Path, optional
-        File for the faces, as ``faces.json``; nothing is written if None.
+    model : A COLMAP model, or the folder of several.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    solve : Every way to a face weighed; or as in Zhang & Wei (2017): λ by rows, three-point frames, single transforms.
+    out : File for the faces, as ``faces.json``; nothing is written if None.
 
     Raises
     ------
@@ -242,24 +238,17 @@ def crosscheck(
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    colmap : str or Path, optional
-        The native program; ``colmap`` on the PATH if None.
-    tolerances : Tolerances
-        Largest differences that are accepted.
-    timeout_s : float
-        Time for one group after which the native mapper is stopped, s.
-    progress : callable, optional
-        Called with (stage, done, total).
-    into_report : bool
-        Whether the comparison is added to ``report.json`` and ``report.html`` in the run's folder; else nothing is
-        written.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    colmap : The native program; ``colmap`` on the PATH if None.
+    tolerances : Largest differences that are accepted.
+    timeout_s : Time for one group after which the native mapper is stopped, s.
+    progress : Called with (stage, done, total).
+    into_report : Whether the comparison is added to ``report.json`` and ``report.html`` in the run's folder; else
+        nothing is written.
 
     Returns
     -------
-    Crosscheck
-        ``differences`` beyond the tolerances, in words; those of ``mapping``, between the two programs, and of
+    Crosscheck : ``differences`` beyond the tolerances, in words; those of ``mapping``, between the two programs, and of
         ``result``, from the native models against the run; µm, millidegrees and σ.
 
     Raises

@@ -267,15 +267,11 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    out : str or Path
-        New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` (a launch file of
-        ROS 2), ``.yml`` (OpenCV) or ``.csv``.
-    form : {"urdf", "xacro", "tf2", "ros2", "opencv", "csv"}, optional
-        Form in place of that of the suffix.
-    name : str
-        Name of the target frame, and prefix of the other frames' names.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` (a launch file of ROS
+        2), ``.yml`` (OpenCV) or ``.csv``.
+    form : Form in place of that of the suffix.
+    name : Name of the target frame, and prefix of the other frames' names.
 
     Raises
     ------

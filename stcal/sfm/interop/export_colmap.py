@@ -60,12 +60,9 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    out : str or Path
-        New file; it appears complete or not at all.
-    schema : str
-        Version of COLMAP that is to open it: ``3.8`` to ``4.2``. The form is that of 3.8 for all.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : New file; it appears complete or not at all.
+    schema : Version of COLMAP that is to open it: ``3.8`` to ``4.2``. The form is that of 3.8 for all.
 
     Raises
     ------
@@ -136,12 +133,9 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> Exported:
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    out : str or Path
-        New or empty folder; missing parent folders are made.
-    form : {"colmap-bin", "colmap-txt"}
-        The format.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : New or empty folder; missing parent folders are made.
+    form : The format.
 
     Raises
     ------

@@ -326,18 +326,14 @@ def advise(known: KnownRun | AnyRun, count: int = 5, progress: Progress | None =
 
     Parameters
     ----------
-    known : str, Path, SavedRun or RunResult
-        The folder of a finished run, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned; or its
+    known : The folder of a finished run, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned; or its
         geometry, by :func:`known_of`.
-    count : int
-        Number of views to choose, each in addition to those before it.
-    progress : callable, optional
-        Called with (stage, done, total).
+    count : Number of views to choose, each in addition to those before it.
+    progress : Called with (stage, done, total).
 
     Returns
     -------
-    Advice
-        The views, with the worst face and its σ (mm) after each; the present σ and their sources.
+    Advice : The views, with the worst face and its σ (mm) after each; the present σ and their sources.
     """
     if not isinstance(known, KnownRun):
         known = known_of(saved_run(known))
@@ -418,13 +414,11 @@ def noise_of_run(run: AnyRun) -> CentreNoise:
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
 
     Returns
     -------
-    CentreNoise
-        As :class:`stcal.sfm.PlanOptions` takes it.
+    CentreNoise : As :class:`stcal.sfm.PlanOptions` takes it.
     """
     known = known_of(saved_run(run))
     return known.noise.scaled(known.setup.sigma0)

@@ -99,14 +99,10 @@ class CentreNoise:
 
     Parameters
     ----------
-    edge : float
-        Noise along the rim, px^1.5.
-    narrow_px : float
-        Minor semi-axis at which half of the information is lost, px; 0 for no loss.
-    floor_px : float
-        σ per axis that does not depend on the size, px.
-    corner_px : float
-        σ per axis of corners, which have no size, px.
+    edge : Noise along the rim, px^1.5.
+    narrow_px : Minor semi-axis at which half of the information is lost, px; 0 for no loss.
+    floor_px : σ per axis that does not depend on the size, px.
+    corner_px : σ per axis of corners, which have no size, px.
 
     Raises
     ------

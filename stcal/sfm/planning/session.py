@@ -67,28 +67,17 @@ class PlanOptions(Brief):
 
     Parameters
     ----------
-    images : int
-        Number of images of each group.
-    spread_deg : float
-        ± about the view that shows both faces equally, degrees.
-    distance_mm : float
-        Distance of the cameras from the target, mm.
-    width : int
-        Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
-    camera : Camera, optional
-        Camera, whose file must state the image size.
-    groups : tuple of pairs of str, optional
-        Pairs of face ids; the pairs of the design if None.
-    noise : CentreNoise
-        σ of the centres.
-    one_board : bool
-        Whether the same plate is in all groups; else each group has its own.
-    run : RunOptions
-        Flatness, frame, refined intrinsics and reference face.
-    seed : int
-        Seed of the random places of board and cameras.
-    margin_mm : float
-        How far plates without ``outline_mm`` reach beyond the rims of their circles.
+    images : Number of images of each group.
+    spread_deg : ± about the view that shows both faces equally, degrees.
+    distance_mm : Distance of the cameras from the target, mm.
+    width : Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
+    camera : Camera, whose file must state the image size.
+    groups : Pairs of face ids; the pairs of the design if None.
+    noise : σ of the centres.
+    one_board : Whether the same plate is in all groups; else each group has its own.
+    run : Flatness, frame, refined intrinsics and reference face.
+    seed : Seed of the random places of board and cameras.
+    margin_mm : How far plates without ``outline_mm`` reach beyond the rims of their circles.
 
     Raises
     ------
@@ -172,20 +161,15 @@ def plan(
 
     Parameters
     ----------
-    options : PlanOptions
-        Images, camera, groups and noise.
-    target : TargetDesign
-        Design of the target, drawing frame of each face, mm.
-    board : BoardDesign, optional
-        Board with its σ, mm; the reference board if None. There must be none beside a body with boards or tags.
-    nominal : dict of Rigid, or path, optional
-        Pose of every face in one common frame, mm, by face id, or ``faces.json`` of an earlier run; the rough poses of
-        the design if None.
+    options : Images, camera, groups and noise.
+    target : Design of the target, drawing frame of each face, mm.
+    board : Board with its σ, mm; the reference board if None. There must be none beside a body with boards or tags.
+    nominal : Pose of every face in one common frame, mm, by face id, or ``faces.json`` of an earlier run; the rough
+        poses of the design if None.
 
     Returns
     -------
-    Plan
-        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
+    Plan : σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
 
     Raises
     ------

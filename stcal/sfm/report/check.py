@@ -81,22 +81,14 @@ class Check(Brief):
 
     Parameters
     ----------
-    key : str
-        Short name by which files and programs know the check.
-    title : str
-        Its name for people.
-    verdict : {"passed", "suspicious", "failed", "not possible"}
-        A failed check makes the answer of the run "no".
-    reason : str
-        The verdict in words.
-    measured : tuple of TestedValue
-        Values, the worst first.
-    tested : int
-        Number of values tested.
-    names : tuple of str
-        Names of the values beyond their limits, the worst first.
-    remedy : str
-        What to do about it; empty if there is nothing to do.
+    key : Short name by which files and programs know the check.
+    title : Its name for people.
+    verdict : A failed check makes the answer of the run "no".
+    reason : The verdict in words.
+    measured : Values, the worst first.
+    tested : Number of values tested.
+    names : Names of the values beyond their limits, the worst first.
+    remedy : What to do about it; empty if there is nothing to do.
     enlarges : float
         Factor on the σ of the result by which they cover what the check found; 1 if it found nothing, or too much.
     """

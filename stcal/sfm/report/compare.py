@@ -109,10 +109,8 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
 
     Parameters
     ----------
-    run : str or Path
-        The run's folder, or its ``faces.json`` alone; the labels are not compared then.
-    truth : str or Path
-        ``truth.json`` of the data set.
+    run : The run's folder, or its ``faces.json`` alone; the labels are not compared then.
+    truth : ``truth.json`` of the data set.
 
     Returns
     -------
@@ -163,16 +161,13 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
 
     Parameters
     ----------
-    poses : str or Path
-        ``poses.csv`` of ``measure``.
-    truth : str or Path
-        ``truth.json`` of the data set. Images are found in it by their name below ``images``, or by the name of the
+    poses : ``poses.csv`` of ``measure``.
+    truth : ``truth.json`` of the data set. Images are found in it by their name below ``images``, or by the name of the
         file where only one image has it.
 
     Returns
     -------
-    ComparePosesFile
-        Errors of each pose, µm and millidegrees, also over its σ.
+    ComparePosesFile : Errors of each pose, µm and millidegrees, also over its σ.
 
     Raises
     ------

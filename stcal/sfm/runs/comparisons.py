@@ -137,18 +137,13 @@ class Tolerances:
 
     Parameters
     ----------
-    face_um, face_mdeg : float, optional
-        Of the position and the rotation of a face, µm and millidegrees.
-    circle_um : float, optional
-        Of a circle, µm.
-    camera_um, camera_mdeg : float, optional
-        Of the position and the attitude of a camera, µm and millidegrees.
-    sigma : float
-        Of our result from the native models, faces and circles, in units of their own σ: half a σ, added to σ, makes
-        1.12 σ.
-    mapped_sigma : float
-        Of the two programs' own results, in the same unit. They are computed group by group with iterations that end
-        earlier: noise does not explain differences beyond 3 σ.
+    face_um, face_mdeg : Of the position and the rotation of a face, µm and millidegrees.
+    circle_um : Of a circle, µm.
+    camera_um, camera_mdeg : Of the position and the attitude of a camera, µm and millidegrees.
+    sigma : Of our result from the native models, faces and circles, in units of their own σ: half a σ, added to σ,
+        makes 1.12 σ.
+    mapped_sigma : Of the two programs' own results, in the same unit. They are computed group by group with iterations
+        that end earlier: noise does not explain differences beyond 3 σ.
 
     Raises
     ------

@@ -185,17 +185,13 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
 
     Parameters
     ----------
-    run : str, Path, SavedRun or RunResult
-        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
-    pdf : bool
-        Whether the PDF is written, beside the page; it needs the extra ``pdf``.
-    out : str or Path, optional
-        File for the page (HTML); the page in the run's folder is replaced if None.
+    run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    pdf : Whether the PDF is written, beside the page; it needs the extra ``pdf``.
+    out : File for the page (HTML); the page in the run's folder is replaced if None.
 
     Returns
     -------
-    ReportAgain
-        Paths of the ``files`` that were written, and ``notes``.
+    ReportAgain : Paths of the ``files`` that were written, and ``notes``.
 
     Raises
     ------

@@ -29,38 +29,25 @@ class RunOptions:
 
     Parameters
     ----------
-    solve : {"joint", "chain", "paper"}, optional
-        One adjustment over all groups; or group by group; or Zhang & Wei (2017) as published, from detection on, which
-        also decides ``frame`` and ``eccentricity``. If None, ``joint``, or ``chain`` for the uncorrected control.
-    frame : {"plane", "three-point"}, optional
-        Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). If None, ``plane``, or
+    solve : One adjustment over all groups; or group by group; or Zhang & Wei (2017) as published, from detection on,
+        which also decides ``frame`` and ``eccentricity``. If None, ``joint``, or ``chain`` for the uncorrected control.
+    frame : Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). If None, ``plane``, or
         ``three-point`` for the uncorrected control.
-    eccentricity : bool
-        Whether it is corrected; if not, the run is the uncorrected control.
-    reference_face : str, optional
-        Id of the face whose frame is the target frame; the first face of the design if None.
-    pairs : PairOptions
-        Options of the initial pair.
-    ellipses : EllipseOptions
-        Options of detection.
-    workers : int, optional
-        Number of processes; one per core if None.
-    flatness_mm : float, optional
-        σ of a circle about the plane of its face, mm; None if it is unknown.
-    refine_camera : bool
-        Whether to adjust the intrinsics, with the given ones as observations.
-    rim : bool, optional
-        Whether to estimate the height of a rim in front of the faces' circles, and to give the faces of their luminous
-        surface; if None, where the radii show a rim for certain and the design states none.
+    eccentricity : Whether it is corrected; if not, the run is the uncorrected control.
+    reference_face : Id of the face whose frame is the target frame; the first face of the design if None.
+    pairs : Options of the initial pair.
+    ellipses : Options of detection.
+    workers : Number of processes; one per core if None.
+    flatness_mm : σ of a circle about the plane of its face, mm; None if it is unknown.
+    refine_camera : Whether to adjust the intrinsics, with the given ones as observations.
+    rim : Whether to estimate the height of a rim in front of the faces' circles, and to give the faces of their
+        luminous surface; if None, where the radii show a rim for certain and the design states none.
     board_only : bool
         Whether the board alone was photographed, so that λ and its residuals are the result. If False, the images tell.
-    compare : {"paper"}, optional
-        Also solve the same photographs as published, and step by step from there, for the report.
-    exclude : tuple of str
-        Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
-    expect_faces : tuple of str
-        Faces that the photographs were to show: the command ends with 4 where one is missing. If empty, the names of
-        the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
+    compare : Also solve the same photographs as published, and step by step from there, for the report.
+    exclude : Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
+    expect_faces : Faces that the photographs were to show: the command ends with 4 where one is missing. If empty, the
+        names of the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
 
     Raises
     ------

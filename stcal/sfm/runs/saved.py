@@ -55,19 +55,14 @@ class ImageResult(Brief):
 
     Parameters
     ----------
-    name, group : str
-        Of the image, as in all results.
-    camera_from_target : Rigid
-        Its pose as adjusted, mm.
+    name, group : Of the image, as in all results.
+    camera_from_target : Its pose as adjusted, mm.
     covariance : (6, 6) array
         Covariance of the pose from this image's circles, rad and mm, left perturbation in the camera frame: target,
         board and camera are taken as they were calibrated. ``stcal.sfm.measure`` adds the target's own uncertainty.
-    labels : tuple of Label
-        n circles and dots of the image that were used.
-    xy_px : (n, 2) array
-        Their measured centres, corrected for the eccentricity, px.
-    residuals_px : (n, 2) array
-        Measured minus projected, px.
+    labels : n circles and dots of the image that were used.
+    xy_px : (n, 2) array. Their measured centres, corrected for the eccentricity, px.
+    residuals_px : (n, 2) array. Measured minus projected, px.
     """
 
     name: str
@@ -90,24 +85,16 @@ class SavedRun(Brief):
 
     Parameters
     ----------
-    out : Path or None
-        The run's folder; None if no file stays.
-    photographs : Path or str
-        The folder of photographs as given.
-    options : RunOptions
-        Options with every default decided.
-    camera : Camera
-        The camera as its file states it; refined intrinsics are ``calibration.camera``.
-    target_design, board_design : TargetDesign, BoardDesign
-        The designs as given.
+    out : The run's folder; None if no file stays.
+    photographs : The folder of photographs as given.
+    options : Options with every default decided.
+    camera : The camera as its file states it; refined intrinsics are ``calibration.camera``.
+    target_design, board_design : The designs as given.
     observations : tuple of ImageObservations
         Labelled centres of all images, px, in the database's order; without the shapes of the ellipses if read back.
-    corrected_px : tuple of (n, 2) array
-        By image, the centres in the database, corrected for the eccentricity.
-    faces_file : FacesFile or None
-        Content of ``faces.json``; None of the board alone.
-    report : dict
-        Content of ``report.json``.
+    corrected_px : tuple of (n, 2) array. By image, the centres in the database, corrected for the eccentricity.
+    faces_file : Content of ``faces.json``; None of the board alone.
+    report : Content of ``report.json``.
     """
 
     out: Path | None
@@ -203,28 +190,17 @@ class RunResult(SavedRun):
 
     Parameters
     ----------
-    detection : DetectionResult
-        Detections of each image, and the images skipped.
-    labelled : tuple of LabelledImage
-        Labelled centres of all images, px, in the database's order.
-    graph : ImageGraph
-        Pairs of images that were matched.
-    solutions : tuple of GroupSolution
-        Solutions of the single groups, in worlds without unit.
-    calibration : Calibration
-        Target and models in mm, target frame.
-    chains : dict of tuple of FaceChain
-        Ways to each face through single groups, by face id.
-    notes : tuple of str
-        What was left out or did not settle, and what to do.
-    checks : tuple of Check
-        Checks in the order of the report.
-    comparison : Comparison, optional
-        Comparison with the published method, if requested.
-    judgement : Judgement, optional
-        The report in words, once it is made.
-    camera_given : bool
-        False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
+    detection : Detections of each image, and the images skipped.
+    labelled : Labelled centres of all images, px, in the database's order.
+    graph : Pairs of images that were matched.
+    solutions : Solutions of the single groups, in worlds without unit.
+    calibration : Target and models in mm, target frame.
+    chains : Ways to each face through single groups, by face id.
+    notes : What was left out or did not settle, and what to do.
+    checks : Checks in the order of the report.
+    comparison : Comparison with the published method, if requested.
+    judgement : The report in words, once it is made.
+    camera_given : False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
     detection: DetectionResult
@@ -374,13 +350,11 @@ def load_run(folder: str | Path) -> SavedRun:
 
     Parameters
     ----------
-    folder : path
-        Folder that was given to the run as ``out``.
+    folder : Folder that was given to the run as ``out``.
 
     Returns
     -------
-    SavedRun
-        Inputs, labelled centres and results of the run.
+    SavedRun : Inputs, labelled centres and results of the run.
 
     Raises
     ------
