@@ -81,6 +81,12 @@ def own_copy(source: Path, to: Path, ignore: Callable | None = None) -> Path:
     return Path(shutil.copyfile(source, to / source.name if to.is_dir() else to))
 
 
+def written(path: Path, content: str | bytes) -> Path:
+    """The path, with this content in its file."""
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
 def unsealed_copy(run: Path, to: Path, ignore: Callable | None = None) -> Path:
     """Copy a run without the hashes of its files, as old versions left it: an edited file is then read; as above."""
     unseal(own_copy(run, to, ignore))

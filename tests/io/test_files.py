@@ -15,6 +15,7 @@ from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, keep_ap
 from stcal.io.json import read_json
 from stcal.io.table import read_table
 from tests.outcome import refuses
+from tests.shared import written
 
 READERS = {
     "camera": (read_camera, SETTINGS_BYTES),
@@ -23,13 +24,6 @@ READERS = {
     "table": (lambda path: read_table(path, "table"), TABLE_BYTES),
     "result": (lambda path: read_json(path, "result", "give another"), TABLE_BYTES),
 }
-
-
-def test_as_much_as_there_may_be_is_read(tmp_path):
-    (tmp_path / "a").write_bytes(b"abcde")
-    assert read_bytes(tmp_path / "a", 5) == b"abcde"
-    with pytest.raises(OSError, match="0 MB, at most 0 MB are read"):
-        read_bytes(tmp_path / "a", 4)
 
 
 @pytest.mark.parametrize("kind", READERS)
@@ -55,10 +49,12 @@ def test_a_link_to_itself(tmp_path):
     refuses("E-CAMERA-UNREADABLE … symbolic links", read_camera, link)
 
 
-def test_a_file_is_read_in_memory_of_its_own_size(tmp_path):
+def test_as_much_as_there_may_be_is_read_in_memory_of_its_own_size(tmp_path):
     """`read` takes memory for all that it is asked for, and the limits are far above any file."""
-    path = tmp_path / "small.txt"
-    path.write_bytes(b"x" * 1000)
+    path = written(tmp_path / "small.txt", b"x" * 1000)
+    assert read_bytes(path, 1000) == b"x" * 1000
+    with pytest.raises(OSError, match="0 MB, at most 0 MB are read"):
+        read_bytes(path, 999)
     tracemalloc.start()
     try:
         assert read_bytes(path, MODEL_BYTES) == b"x" * 1000

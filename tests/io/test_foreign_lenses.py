@@ -13,7 +13,9 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.difference import compare_cameras, fit_lens
 from stcal.io.cameras.foreign_lenses import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_camera, read_lens
+from tests.io.camera_files import project
 from tests.outcome import refuses
+from tests.shared import written
 
 WIDTH, HEIGHT = 1280, 961
 COLMAP = {
@@ -44,17 +46,14 @@ def colmap_params(model: str) -> list[float]:
 
 def lens_of(tmp_path, model: str):
     line = " ".join(map(repr, colmap_params(model)))
-    (tmp_path / "cameras.txt").write_text(f"7 {model} {WIDTH} {HEIGHT} {line}\n")
-    return read_lens(tmp_path / "cameras.txt")
+    return read_lens(written(tmp_path / "cameras.txt", f"7 {model} {WIDTH} {HEIGHT} {line}\n"))
 
 
 @pytest.mark.parametrize("model", COLMAP_FOREIGN)
 def test_colmap_projects_the_same(tmp_path, model):
     camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=colmap_params(model))
     wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
-    lens = lens_of(tmp_path, model)
-    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
-    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    np.testing.assert_allclose(project(lens_of(tmp_path, model), rays()), wanted, atol=1e-10)
     assert int(pycolmap.CameraModelId.__members__[model]) == COLMAP_FOREIGN[model][0]
 
 
@@ -68,10 +67,8 @@ def test_the_camera_of_a_database_is_read(tmp_path, model):
             database.write_camera(camera)
     before = path.read_bytes()
     refuses("E-CAMERA-SEVERAL … 2 cameras, 1 needed … 1, 2 … --name", read_lens, path)
-    lens = read_lens(path, "2")
-    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
     wanted = np.array([cameras[1].img_from_cam(ray) for ray in rays()]) - 0.5
-    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    np.testing.assert_allclose(project(read_lens(path, "2"), rays()), wanted, atol=1e-10)
     assert path.read_bytes() == before
 
 
@@ -91,11 +88,8 @@ def test_a_database_of_something_else_is_refused(tmp_path):
 @pytest.mark.parametrize("count", [12, 14])
 def test_opencv_projects_the_same(tmp_path, count):
     matrix = [812.25, 0, 640.125, 0, 809.5, 478.0625, 0, 0, 1]
-    (tmp_path / "c.yaml").write_text(
-        f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {matrix}\n"
-        f"distortion_coefficients: {TILTED[:count]}\n"
-    )
-    lens = read_lens(tmp_path / "c.yaml")
+    text = f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {matrix}\n"
+    lens = read_lens(written(tmp_path / "c.yaml", f"{text}distortion_coefficients: {TILTED[:count]}\n"))
     k = np.reshape(matrix, (3, 3))
     wanted = cv2.projectPoints(rays(), np.zeros(3), np.zeros(3), k, np.array(TILTED[:count]))[0].reshape(-1, 2)
     np.testing.assert_allclose(lens.project(rays()), wanted, atol=1e-10)
@@ -103,8 +97,8 @@ def test_opencv_projects_the_same(tmp_path, count):
 
 
 def kalibr(tmp_path, lens: str, shape: list[float], distortion: str = "none", k: tuple[float, ...] = ()) -> ForeignLens:
-    (tmp_path / "chain.yaml").write_text(KALIBR.format(lens, [*shape, 400.5, 402.0, 640, 478], distortion, list(k)))
-    return read_lens(tmp_path / "chain.yaml")
+    text = KALIBR.format(lens, [*shape, 400.5, 402.0, 640, 478], distortion, list(k))
+    return read_lens(written(tmp_path / "chain.yaml", text))
 
 
 def test_kalibrs_lenses_project_by_their_papers(tmp_path):
@@ -154,12 +148,10 @@ def test_mrcals_splines_project_as_mrcal_does(tmp_path, order):
     numbers = [1200, 1205, 999.5, 749.5, *np.round(0.02 * np.sin(np.arange(176)), 6).tolist()]
     name = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order={order}_Nx=11_Ny=8_fov_x_deg=120"
     text = f"{{'lensmodel': '{name}', 'intrinsics': {numbers}, 'imagersize': [2000, 1500]}}"
-    (tmp_path / "c.cameramodel").write_text(text)
-    lens = read_lens(tmp_path / "c.cameramodel")
-    found = lens.project(np.array([[0.1, 0.2, 1], [0.5, -0.4, 1], [-1, 0.6, 1]]))
+    path = written(tmp_path / "c.cameramodel", text)
+    found = read_lens(path).project(np.array([[0.1, 0.2, 1], [0.5, -0.4, 1], [-1, 0.6, 1]]))
     np.testing.assert_allclose(found, MRCAL[order], atol=1e-9)
-    (tmp_path / "c.cameramodel").write_text(text.replace("1205,", ""))
-    refuses("E-CAMERA-COEFFICIENTS … 179 … 11 … 8 … 180", read_lens, tmp_path / "c.cameramodel")
+    refuses("E-CAMERA-COEFFICIENTS … 179 … 11 … 8 … 180", read_lens, written(path, text.replace("1205,", "")))
 
 
 @pytest.mark.slow
@@ -183,13 +175,9 @@ def test_a_fit_is_off_by_no_more_than_it_says(tmp_path, model, most_px):
 
 def test_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
     """A double sphere of 220°: the image reaches beyond what a model here sees."""
-    (tmp_path / "chain.yaml").write_text(KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", []))
-    lens = read_lens(tmp_path / "chain.yaml")
-    assert fit_lens(lens, WIDTH, HEIGHT).share < 0.5
-
-
-def test_other_commands_ask_for_the_conversion(tmp_path):
-    lens_of(tmp_path, "FOV")
+    text = KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", [])
+    assert fit_lens(read_lens(written(tmp_path / "chain.yaml", text)), WIDTH, HEIGHT).share < 0.5
+    lens_of(tmp_path, "FOV")  # and other commands ask for the conversion
     refuses("E-CAMERA-MODEL … COLMAP's FOV", read_camera, tmp_path / "cameras.txt")
 
 
@@ -206,8 +194,7 @@ def test_other_commands_ask_for_the_conversion(tmp_path):
     ],
 )  # fmt: skip
 def test_a_wrong_lens_is_named(tmp_path, text, message):
-    (tmp_path / "camera").write_text(text)
-    refuses(message, read_lens, tmp_path / "camera")
+    refuses(message, read_lens, written(tmp_path / "camera", text))
 
 
 CAHVOR = (4842.918, 4842.771, 1970.528, 1085.302, -0.001, 0.002, -0.637, -0.002, 0.016)
@@ -215,8 +202,7 @@ CAHVOR = (4842.918, 4842.771, 1970.528, 1085.302, -0.001, 0.002, -0.637, -0.002,
 
 def cahvor_file(path, numbers):
     text = f"{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': {list(numbers)}, 'imagersize': [4000, 2200]}}"
-    path.write_text(text)
-    return read_lens(path)
+    return read_lens(written(path, text))
 
 
 def test_cahvor_projects_as_mrcal_does(tmp_path):
@@ -298,10 +284,10 @@ def test_mrcals_region_is_read(tmp_path):
         "{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
         f"'valid_intrinsics_region': {REGION.tolist()}, 'imagersize': [{WIDTH}, {HEIGHT}]}}"
     )
-    (tmp_path / "c.cameramodel").write_text(text)
-    np.testing.assert_array_equal(read_lens(tmp_path / "c.cameramodel").region, REGION)
-    (tmp_path / "c.cameramodel").write_text(text.replace(str(REGION.tolist()), "[1, 2, 3]"))
-    refuses("E-CAMERA-CONTENT … valid_intrinsics_region", read_lens, tmp_path / "c.cameramodel")
+    path = written(tmp_path / "c.cameramodel", text)
+    np.testing.assert_array_equal(read_lens(path).region, REGION)
+    wrong = written(path, text.replace(str(REGION.tolist()), "[1, 2, 3]"))
+    refuses("E-CAMERA-CONTENT … valid_intrinsics_region", read_lens, wrong)
 
 
 def test_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(recwarn):

@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.io import images
 from stcal.io.files import RUN_MARKER
 from stcal.io.images import TOP_GROUP, common_size, decode, find_images, name_fault, size_fault, thumbnail
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
 
 
 def encoded(suffix, image=None, params=()):
@@ -37,15 +37,10 @@ def test_groups_and_order(tmp_path):
         ("b", "b/2.JPG"),
     ]
     assert [(s.name, s.reason) for s in skipped] == [("b/notes.txt", "not an image file")]
-
-
-def test_a_single_image(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(b"x")
-    (tmp_path / "a.mp4").write_bytes(b"x")
-    files, skipped = find_images(tmp_path / "a.jpg")
-    assert ([(f.path, f.name, f.group) for f in files], skipped) == ([(tmp_path / "a.jpg", "a.jpg", TOP_GROUP)], [])
-    with fails_with("E-IMAGES-FOLDER … a.mp4: not a folder, and not an image file; give a folder or an image"):
-        find_images(tmp_path / "a.mp4")
+    one = tmp_path / "top.bmp"
+    assert find_images(one) == ([images.ImageFile(one, "top.bmp", TOP_GROUP)], [])
+    said = "E-IMAGES-FOLDER … notes.txt: not a folder, and not an image file; give a folder or an image"
+    refuses(said, find_images, tmp_path / "b/notes.txt")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
@@ -149,8 +144,8 @@ def test_most_images_state_the_size(tmp_path):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((height, width), np.uint8))
     files, _ = find_images(tmp_path)
     assert common_size(files) == ((60, 40), "1.png")
-    with fails_with("E-IMAGES-SIZES … 1 of 40×60 px, first 0.png and 1 of 60×40 px, first 1.png … turn one half back"):
-        common_size(files[:2])
+    halves = "1 of 40×60 px, first 0.png and 1 of 60×40 px, first 1.png … turn one half back"
+    refuses(f"E-IMAGES-SIZES … {halves}", common_size, files[:2])
     refuses("E-IMAGES-SIZES … leave one size out", common_size, [files[0], files[4]])
     files[0].path.write_bytes(files[0].path.read_bytes()[:60])
     assert common_size(files[:2]) == ((60, 40), "1.png")  # the header of a file that cannot be read does not decide

@@ -13,11 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.join import join_tables, stack_tables
 from stcal.register.registered import read_pairs
 from tests.outcome import refuses
-
-
-def written(path, text: str):
-    path.write_text(text, encoding="utf-8")
-    return path
+from tests.shared import written
 
 
 def test_rows_of_one_key_stand_side_by_side(tmp_path):

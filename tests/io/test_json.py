@@ -1,6 +1,9 @@
-"""JSON files: any content is a value or one line of error; result files say what is wrong where."""
+"""JSON files: any content is a value or one line of error; result files say what is wrong where. Texts of TOML."""
 
 import json
+import time
+import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -14,7 +17,9 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
 from stcal.io.json import ByFace, Named, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
+from stcal.io.toml import toml_of, toml_string
 from tests.outcome import fails_with, refuses
+from tests.shared import written
 
 
 class Row(Part):
@@ -43,8 +48,7 @@ def test_written_as_given_and_read_back(tmp_path):
     text = json_text(Example.model_validate(WHOLE).content())
     plain = WHOLE | {"poses": {"1": POSE.matrix().tolist()}, "middle": [0.1, 0.2, 0.3]}
     assert text == json.dumps(plain, indent=1, ensure_ascii=False) + "\n"  # 1 stays 1, and later is not there
-    path = tmp_path / "example.json"
-    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    path = written(tmp_path / "example.json", b"\xef\xbb\xbf" + text.encode())
     found = read_result(path, Example, "example", "make one")
     assert np.array_equal(found.poses["1"], POSE.matrix())
     assert found.later is None
@@ -86,24 +90,19 @@ def test_keys_of_later_versions_are_passed_over_and_none_is_written():
     ],
 )
 def test_a_file_that_is_no_object(tmp_path, content, reason):
-    path = tmp_path / "some.json"
-    path.write_bytes(content)
+    path = written(tmp_path / "some.json", content)
     with fails_with(reason) as caught:
         read_json(path, "file", "make one")
     assert str(caught.value).startswith(f"file {path}: ")
     assert str(caught.value).endswith("; make one")
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    refuses("E-FILE-UNREADABLE … some.json … make one", read_json, tmp_path / "some.json", "file", "make one")
+    refuses("E-FILE-UNREADABLE … none.json … make one", read_json, tmp_path / "none.json", "file", "make one")
 
 
 @pytest.mark.slow
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_any_bytes_are_a_value_or_one_line(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "any.json"
-    path.write_bytes(content)
+    path = written(tmp_path_factory.getbasetemp() / "any.json", content)
     try:
         message = str(read_json(path, "file", "make one"))
     except InputError as error:
@@ -140,3 +139,17 @@ def test_an_object_of_a_file_holds_named_attributes_of_a_result_or_all_its_field
     assert WithKeys.model_validate(content).content() == content
     with pytest.raises(ValidationError, match="an object with pose sigma worst needed"):
         WithKeys.model_validate(content | {"every": {"pose": 1}})
+
+
+@given(st.text())
+def test_a_text_comes_back_as_it_was(text):
+    assert tomllib.loads(f"name = {toml_string(text)}") == {"name": text}
+
+
+@pytest.mark.parametrize("filled", ["9", "x", "[", '"', " ", ",", "."])
+def test_a_long_line_is_judged_as_fast_as_it_is_read(filled):
+    """Its length squared would be minutes."""
+    start = time.process_time()
+    with suppress(ValueError):
+        toml_of("a = 1\n" + filled * 300_000 + "\n")
+    assert time.process_time() - start < 5

@@ -1,6 +1,6 @@
 """Readers of files that people or other programs write: another encoding, line end or order of keys changes nothing.
 
-One key more is named. Camera files: ``test_camera_programs.py``.
+One key more is named. Camera files: ``test_camera.py``.
 """
 
 import json

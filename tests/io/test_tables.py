@@ -1,21 +1,26 @@
-"""Tables of other programs: separators, decimal commas, units in brackets, SpatialAnalyzer."""
+"""Tables of other programs: separators, decimal commas, units in brackets, SpatialAnalyzer, COLMAP's lines of images;
+rotations in columns, by the controllers' own formulas, and quaternions that hold something else than they say."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import stcal
+from stcal.geometry.rigid import Poses
 from stcal.io.join import join_tables
-from stcal.io.table import COVARIANCE, LENGTHS, csv_rows, csv_text, read_table
+from stcal.io.rotations import FIRST, INVERTED, LAST, READINGS, read_rotations
+from stcal.io.static_transforms import image_lines
+from stcal.io.table import COVARIANCE, LENGTHS, Table, csv_rows, csv_text, read_table
 from tests.outcome import fails_with, refuses
+from tests.shared import written
 
 POINTS = np.array([[-594.288, -1.155, 162.397], [1616.584, -790.796, 506.870], [0.125, 2.0, -3.5]])
 
 
-def table(tmp_path, text, name="t.csv"):
-    (tmp_path / name).write_text(text, encoding="utf-8")
-    return read_table(tmp_path / name, "data")
+def table(tmp_path, text, order="wxyz"):
+    return read_table(written(tmp_path / "t.csv", text), "data", order)
 
 
 def lines(separator, comma=False):
@@ -117,12 +122,10 @@ def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
 
 
 def test_key_columns_of_two_names(tmp_path):
-    (tmp_path / "a.csv").write_text("image,q1_deg\np2,20\np1,10\n")
-    (tmp_path / "b.csv").write_text("Point Name;X [mm]\np1;1,5\np2;2,5\n")
-    found = join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image=Point Name").table
-    np.testing.assert_array_equal(found.numbers("x_mm"), [2.5, 1.5])
-    with fails_with("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME"):
-        join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image")
+    a = written(tmp_path / "a.csv", "image,q1_deg\np2,20\np1,10\n")
+    b = written(tmp_path / "b.csv", "Point Name;X [mm]\np1;1,5\np2;2,5\n")
+    np.testing.assert_array_equal(join_tables(a, b, "image=Point Name").table.numbers("x_mm"), [2.5, 1.5])
+    refuses("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME", join_tables, a, b, "image")
 
 
 @pytest.mark.parametrize("units", ["mm", "[mm]", "(mm)", " mm "])
@@ -155,3 +158,138 @@ def test_no_other_place_writes_csv():
     package = Path(stcal.__file__).parent
     found = {path for path in package.rglob("*.py") if "csv.writer(" in path.read_text(encoding="utf-8")}
     assert found == {package / "io" / "table.py"}
+
+
+def about(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = c
+    turn[i, j], turn[j, i] = -s, s
+    return turn
+
+
+def read(header: str, *values: float, rotation: str | None = None):
+    columns = {name: np.array([value]) for name, value in zip(header.split(","), values, strict=True)}
+    return read_rotations(Table("table", columns, [2]), rotation=rotation)
+
+
+FANUC = about("z", 30) @ about("y", 20) @ about("x", 10)
+"""Rz(R) Ry(P) Rx(W), FANUC's and Yaskawa's manuals; Rz(A) Ry(B) Rx(C), KUKA's."""
+
+
+@pytest.mark.parametrize(
+    ("header", "values", "rotation", "expected"),
+    [
+        ("w_deg,p_deg,r_deg", (10, 20, 30), None, FANUC),
+        ("W_DEG,P_DEG,R_DEG", (10, 20, 30), "yaskawa", FANUC),
+        ("a_deg,b_deg,c_deg", (30, 20, 10), None, FANUC),
+        ("a_deg,b_deg,c_deg", (10, 20, 30), "mitsubishi-abc", FANUC),
+        ("roll_deg,pitch_deg,yaw_deg", (10, 20, 30), None, FANUC),
+        ("rpy_roll_rad,rpy_pitch_rad,rpy_yaw_rad", np.radians([10, 20, 30]), None, FANUC),
+        ("o_deg,a_deg,t_deg", (10, 20, 30), None, about("z", 10) @ about("y", 20) @ about("z", 30)),
+        ("rx_deg,ry_deg,rz_deg", (10, 20, 30), "yaskawa", FANUC),
+        ("rx_deg,ry_deg,rz_deg", (10, 20, 30), "staubli", about("x", 10) @ about("y", 20) @ about("z", 30)),
+        ("rx,ry,rz", (100, 20, 30), "ZYX", about("z", 30) @ about("y", 20) @ about("x", 100)),
+        ("rx_rad,ry_rad,rz_rad", (0, 0, np.radians(40)), None, about("z", 40)),
+        ("rotvec_x_deg,rotvec_y_deg,rotvec_z_deg", (0, -40, 0), None, about("y", -40)),
+    ],
+)
+def test_conventions(header, values, rotation, expected):
+    found = read(header, *values, rotation=rotation)
+    assert np.abs(found.rotation[0] - expected).max() < 1e-12  # rounding
+    assert found.columns == tuple(header.split(","))
+
+
+def test_columns_that_name_their_angles_are_not_overruled_in_silence():
+    header = "euler_ZYX_1_deg,euler_ZYX_2_deg,euler_ZYX_3_deg"
+    assert np.array_equal(read(header, 3, 2, 1).rotation, read(header, 3, 2, 1, rotation="ZYX-deg").rotation)
+    with fails_with("E-OPTION-CONTRADICTS … euler_ZYX_1_deg … --rotation xyz-deg … rename"):
+        read(header, 3, 2, 1, rotation="xyz-deg")
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("rx_deg,ry_deg,rz_deg", "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot"),
+        ("rx,ry,rz", "E-ROTATION-AMBIGUOUS … --rotation … ur-rotvec, yaskawa"),
+        ("w_rad,p_rad,r_rad", "E-ROTATION-AMBIGUOUS … wpr"),
+        ("a,b,c", "E-ROTATION-AMBIGUOUS … abc"),
+        ("roll,pitch,yaw", "E-ROTATION-AMBIGUOUS … roll, pitch, yaw"),
+    ],
+)
+def test_names_that_leave_it_open(header, words):
+    refuses(words, read, header, 10, 20, 30)
+    assert read(header.rpartition(",")[0], 10, 20) is None
+
+
+@pytest.mark.parametrize("header", ["roll_rad,pitch_rad,yaw_rad", "rotvec_x_rad,rotvec_y_rad,rotvec_z_rad"])
+def test_degrees_that_are_called_radians(header):
+    refuses("E-ANGLE-UNIT … 13 rad … _deg … --rotation", read, header, 10, -13, 0)
+    assert len(read(header, 12, -12, 0).rotation) == 1  # two turns less a little
+
+
+XYZW = np.array([[0.1, 0.2, 0.3, 0.0], [0.5, -0.5, 0.1, 0.0]])
+XYZW[:, 3] = np.sqrt(1 - (XYZW**2).sum(1))
+TRUE = Rotation.from_quat(XYZW).as_matrix()
+
+
+def poses_of(folder, header: str, values: np.ndarray, order="wxyz", prefix="") -> np.ndarray:
+    """Rotations of a table with columns of this header, and of these values."""
+    rows = "\n".join(",".join(["1", "2", "3", *(repr(float(v)) for v in row)]) for row in values)
+    return table(folder, f"x_mm,y_mm,z_mm,{header}\n{rows}\n", order).poses(prefix).rotation
+
+
+def test_xyzw_is_the_order_in_which_columns_stand_and_else_they_hold_what_their_names_say(tmp_path):
+    for header in ("qw,qx,qy,qz", "qx,qy,qz,qw"):
+        np.testing.assert_allclose(poses_of(tmp_path, header, XYZW, "xyzw"), TRUE, atol=1e-12)
+    header, more = "qa_qw,qa_qx,qa_qy,qa_qz,qa_x_mm,qa_y_mm,qa_z_mm", np.ones((2, 3))
+    np.testing.assert_allclose(poses_of(tmp_path, header, np.hstack([XYZW, more]), "xyzw", "qa_"), TRUE, atol=1e-12)
+    np.testing.assert_allclose(poses_of(tmp_path, "qx,qy,qz,qw", XYZW), TRUE, atol=1e-12)
+    wrong = poses_of(tmp_path, "qw,qx,qy,qz", XYZW)
+    assert np.abs(wrong - TRUE).max() > 0.5
+    np.testing.assert_allclose(LAST.rotations(wrong), TRUE, atol=1e-12)  # the reading is what the option does
+    right = poses_of(tmp_path, "qw,qx,qy,qz", XYZW[:, [3, 0, 1, 2]], "xyzw")
+    np.testing.assert_allclose(FIRST.rotations(right), TRUE, atol=1e-12)
+    assert "--quaternions xyzw" in LAST.remedy
+
+
+@pytest.mark.parametrize("wrong", READINGS, ids=lambda each: each.held)
+def test_the_reading_that_fits_is_found(wrong):
+    rng = np.random.default_rng(3)
+    true = Rotation.random(12, random_state=rng).as_matrix()
+    held = np.swapaxes(true, 1, 2) if wrong.conjugated else true
+    wxyz = Poses(held, np.zeros((12, 3))).quaternions()
+    read = Poses.from_quaternions(wxyz[:, np.argsort(wrong.order)], np.zeros((12, 3))).rotation
+    off = {each.held: np.abs(each.rotations(read) - true).max() for each in READINGS}
+    assert [held for held in off if off[held] < 1e-9] == [wrong.held]
+
+
+def test_half_turns_are_their_own_inverse():
+    half = np.repeat(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix()[None], 5, axis=0)
+    np.testing.assert_allclose(INVERTED.rotations(half), half, atol=1e-12)
+
+
+A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))
+
+
+@pytest.mark.parametrize(
+    ("text", "followed"),
+    [
+        (f"# head\n{A}\n{B}\n{C}\n", [True, True, True]),
+        (f"{A}1.5 2.5 -1 3 4 7\n{B}\n{C}5 6 1\n", [True, True, True]),
+        (A + B + C, [False, False, False]),
+        (f"{A}\n{B}\n{C}", [True, True, False]),
+        (f"\n\n{A}{B}1 2 3\n{C}\n", [False, True, True]),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_every_image_is_read(text, followed, end):
+    images = image_lines(text.replace("\n", end), "images.txt")
+    assert [image.name for image in images] == ["a.jpg", "b c.jpg", "0003"]
+    assert [image.followed for image in images] == followed
+
+
+def test_a_line_of_another_form_is_named():
+    refuses("E-MODEL-UNREADABLE … line 2 … 2 cells", image_lines, f"{A}1.0 2.0\n{B}\n", "images.txt")
+    refuses("E-MODEL-UNREADABLE … line 3", image_lines, f"{A}\nno image\n", "images.txt")
