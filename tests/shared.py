@@ -1,5 +1,6 @@
 """Data that tests share: made once for all processes of a test run, not to be written to."""
 
+import csv
 import ctypes
 import json
 import os
@@ -84,6 +85,13 @@ def own_copy(source: Path, to: Path, ignore: Callable | None = None) -> Path:
 def written(path: Path, content: str | bytes) -> Path:
     """The path, with this content in its file."""
     path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def write_rows(path: Path, header, rows) -> Path:
+    """The path, with a table in its file."""
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
     return path
 
 

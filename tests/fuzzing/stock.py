@@ -1,6 +1,5 @@
 """Valid inputs of every command, small, made once; a case copies of them what it spoils."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
 from tests.handeye.photographed import looks, photographs
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
-from tests.shared import own_copy
+from tests.shared import own_copy, write_rows
 from tests.support.arms import elastic
 from tests.support.handeye import simulated
 
@@ -84,11 +83,6 @@ def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None 
     _tags(folder / "locate", rng)
     _register(folder / "register", rng)
     return folder
-
-
-def write_rows(path: Path, header, rows) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
 
 
 def _of_runs(folder: Path) -> None:

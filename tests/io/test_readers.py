@@ -22,7 +22,10 @@ from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
 from stcal.robot.descriptions import load_universal, load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import Robot
 from stcal.sfm.budget.combine import statement_of
+from tests.boards.test_files import KALIBR
+from tests.io.test_lengths import BOARDS
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(
@@ -72,12 +75,8 @@ def of_target(path: Path) -> np.ndarray:
     return np.column_stack([face.xy_mm, face.radius_mm])
 
 
-def of_robot(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_robot(path)).splitlines())
-
-
-def of_universal(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_universal(path).robot).splitlines())
+def rows_of(load: Callable[[Path], Robot]) -> Callable[[Path], np.ndarray]:
+    return lambda path: np.array(robot_toml(load(path)).splitlines())
 
 
 def of_robot_poses(path: Path) -> np.ndarray:
@@ -108,37 +107,20 @@ MATRICES = [
 ]
 
 
-def of_urdf(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_urdf(path).robot).splitlines())
-
-
 def of_statement(path: Path) -> np.ndarray:
     return np.array([repr(statement_of(StatedSize(), path))])
 
 
 READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
     "table": (TABLE, of_table),
-    "dots": ('rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\nsigma_mm = 0.01\n', of_board),
-    "chessboard": ('type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\n', of_board),
-    "charuco": (
-        'type = "charuco"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\nmarker_mm = 15.0\ndictionary = "4X4_50"\n',
-        of_board,
-    ),
-    "aprilgrid": ('type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\n', of_board),
-    "asymmetric circles": (
-        'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n',
-        of_board,
-    ),
-    "Kalibr, AprilGrid": (
-        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n",
-        of_board,
-    ),
+    **{name: (text.format(20.0, 6.0), of_board) for name, text in BOARDS.items()},
+    "Kalibr, AprilGrid": (KALIBR["aprilgrid"], of_board),
     "target": (
         'name = "a"\npolarity = "dark"\n\n[[face]]\nid = "1"\norigin = "0"\nx = "1"\ny = "2"\ncircles = [\n'
         f"{CIRCLES}\n]\n",
         of_target,
     ),
-    "robot": (ROBOT, of_robot),
+    "robot": (ROBOT, rows_of(load_robot)),
     "easy_handeye": (EASY, of_pairs),
     "body": (
         'name = "a"\n\n[[face]]\nid = "1"\n'
@@ -161,7 +143,7 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         "tag_family: tag36h11\ntag_bundles: [{name: a, layout: [{id: 0, size: 0.08, x: 0.1, y: 0, z: 0, qw: 1.0}]}]\n",
         of_board,
     ),
-    "Universal Robots": (UR, of_universal),
+    "Universal Robots": (UR, rows_of(lambda path: load_universal(path).robot)),
     "poses, rows of TUM": (
         "".join(f"{10 + i}.5 {0.1 * i:.1f} 0.2 0.3 0.0 0.0 {s} {c}\n" for i, s, c in SINES),
         of_robot_poses,
@@ -172,8 +154,8 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         + "".join(f"{i}.png,{i}.5,2,{-i},{c},{s},0,0\n" for i, s, c in SINES),
         of_robot_poses,
     ),
-    "URDF": (URDF, of_urdf),
-    "calibration.conf": (CONF, of_universal),
+    "URDF": (URDF, rows_of(lambda path: load_urdf(path).robot)),
+    "calibration.conf": (CONF, rows_of(lambda path: load_universal(path).robot)),
     "statement": ('[fields]\noperator = "A"\n\n[board]\ntemperature_c = 21.5\n', of_statement),
     "poses, JSON": (json.dumps({"base_from_flange": MATRICES, "units": "m"}, indent=1), of_robot_poses),
     "poses, MoveIt": (
@@ -222,9 +204,8 @@ def test_every_reader_decodes_its_text(tmp_path, name):
     text, read = READERS[name]
     wanted, said = outcome(read, tmp_path / "file", text.encode())
     assert wanted is not None, said
-    found, said = outcome(
-        read, tmp_path / "file", "\n{}\n".format(text.rstrip("\n")).replace("\n", "\r\n").encode("utf-16")
-    )
+    other = "\n{}\n".format(text.rstrip("\n")).replace("\n", "\r\n")
+    found, said = outcome(read, tmp_path / "file", other.encode("utf-16"))
     assert found is not None, said
     np.testing.assert_array_equal(found, wanted)
 

@@ -6,24 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.read import save_camera
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.layout import layout_toml, load_layout
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
-from tests.outcome import ended
+from tests.outcome import program
 from tests.support.tags import random_pose
 
-
-@pytest.fixture
-def locate(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["stcal", "locate", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
+locate = program("stcal", "locate")
 
 
 @pytest.fixture(scope="module")

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 
 from stcal import register, workflows
-from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, placed
-from tests.outcome import ended, fails_with, lines_of, refuses
+from tests.outcome import fails_with, lines_of, program, refuses
 from tests.support.arms import elastic
 from tests.support.point_pairs import B_FROM_A
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 WITH_JOINTS = HEAD + "".join(f",q{i}_deg" for i in range(1, 7))
+
+
+run = program("stcal", "register")
 
 
 def points(n: int = 30, seed: int = 0):
@@ -35,15 +37,6 @@ def written(folder, rows: list[str], head: str = HEAD):
     path = folder / "pairs.csv"
     path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
     return path
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["stcal", "register", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
 
 
 def test_two_motions_are_refused_unless_allowed(run, tmp_path):

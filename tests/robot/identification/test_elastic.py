@@ -19,6 +19,7 @@ from stcal.robot.robot_report import evaluation_report
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
 from tests.outcome import refuses
+from tests.shared import written
 from tests.support.arms import elastic
 
 
@@ -107,12 +108,11 @@ def test_the_elasticity_of_the_file_stays_where_a_rigid_arm_is_asked_for():
 @pytest.mark.slow
 def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path, bending):
     found = bending[2]
-    path = tmp_path / "robot.toml"
-    path.write_text(robot_toml(found.robot))
+    path = written(tmp_path / "robot.toml", robot_toml(found.robot))
     require_identified_written(path, found)
     rows = (replace(found.robot.rows[0], d=found.robot.rows[0].d + 0.001), *found.robot.rows[1:])
-    path.write_text(robot_toml(replace(found.robot, rows=rows)))
-    refuses("E-WRITTEN-DIFFERS … robot.toml", require_identified_written, path, found)
+    other = written(path, robot_toml(replace(found.robot, rows=rows)))
+    refuses("E-WRITTEN-DIFFERS … robot.toml", require_identified_written, other, found)
 
 
 @pytest.mark.slow
@@ -210,8 +210,7 @@ def test_usual_moments_may_all_be_wrong_by_one_factor_where_loads_are_known():
 def test_files_say_what_was_carried_and_from_where_joints_came(tmp_path):
     path, head = tmp_path / "data.csv", [f"q{i}_deg" for i in range(1, 7)] + ["x_mm", "y_mm", "z_mm"]
     text = ",".join([*head, "station", "payload_kg", "approach2"]) + "\n1,2,3,4,5,6,1,2,3,A,0,-1\n2,2,3,4,5,6,1,2,4,B,"
-    path.write_text(f"{text}60,1\n")
-    read = read_measurements(path, mh80())
+    read = read_measurements(written(path, f"{text}60,1\n"), mh80())
     assert read.conditions.payload_kg.tolist() == [0, 60]
     assert read[1:].conditions.payload_kg.tolist() == [60]
     assert (read.stations, read[1:].stations) == (("A", "B"), ("B",))
@@ -223,8 +222,7 @@ def test_files_say_what_was_carried_and_from_where_joints_came(tmp_path):
         ("60,2", "E-APPROACH-VALUE … 3 … approach2 … 2 … 2"),
         ("60,nan", "E-TABLE-NUMBER … approach2 … 'nan'"),
     ):
-        path.write_text(f"{text}{cells}\n")
-        refuses(message, read_measurements, path, mh80())
+        refuses(message, read_measurements, written(path, f"{text}{cells}\n"), mh80())
 
 
 def approached(rows: int, seed: int, size_rad: float):
