@@ -72,7 +72,7 @@ def test_a_side_that_is_stored_a_pose_late_is_named(which, flange, board):
         handeye(late)
 
 
-def test_residuals_that_no_arm_leaves_are_not_to_be_used():
+def test_residuals_that_no_arm_leaves_are_not_to_be_used_and_many_outliers_make_the_setup_suspect():
     given = given_of(22, 0.0, 5)
     rng = np.random.default_rng(1)
     board = given.pairs.camera_from_board
@@ -81,9 +81,6 @@ def test_residuals_that_no_arm_leaves_are_not_to_be_used():
     found = judged(calibrate_handeye(replace(given, pairs=pairs, timed=None), "pose", repeats=0))
     assert found.word == "do not use"
     assert "Residuals" in [finding.title for finding in found.reasons()]
-
-
-def test_many_outliers_make_the_setup_suspect():
     pairs = drawn(15)
     places = pairs.camera_from_board.translation.copy()
     places[:5] += np.random.default_rng(0).normal(0, 40, (5, 3))

@@ -92,25 +92,21 @@ def test_they_are_read_from_what_measure_writes(tmp_path):
     joined = join_tables(robot, table(tmp_path / "poses.csv", {"": board}, image=images, **errors), "image", PREFIXES)
     as_read = read_poses(joined.table)
     assert np.allclose(as_read[[3, 5]].camera_from_board_common, pairs.camera_from_board_common[[3, 5]], rtol=1e-9)
-    columns = {
-        name.replace("camera_from_board", "board_from_camera"): own for name, own in joined.table.columns.items()
-    }
+    other = ("camera_from_board", "board_from_camera")
+    columns = {name.replace(*other): own for name, own in joined.table.columns.items()}
     inverse = read_poses(replace(joined.table, columns=columns))
     step = 1e-4 * pairs.camera_from_board_common[:, :, 1]
     moved = board.moved(step).inverse().difference(board.inverse())
     assert np.allclose(1e-4 * inverse.camera_from_board_common[:, :, 1], moved, rtol=1e-3, atol=1e-9)
 
 
-def test_the_verdict_does_not_ask_for_more_poses():
+def test_the_verdict_does_not_ask_for_more_poses_and_says_what_sigma_lack_without_covariances():
     pairs, _ = draw(0)
     found = handeye(pairs)
     assert found.verdict.word == "use with care"
     assert "have in common" in found.verdict.sentence()
     assert "more poses do not help" in found.verdict.reasons()[0].remedy
     assert np.linalg.eigvalsh(found.covariance - found.common_covariance).min() > 0
-
-
-def test_poses_of_the_board_without_covariance_say_what_sigma_lack():
     pairs = simulated(np.random.default_rng(3), 12, robot=(1e-4, 0.03), camera=(2e-4, 0.05)).pairs
     stated = replace(pairs, camera_from_board_covariance=np.tile(OWN, (12, 1, 1)))
     notes = [calibrate_handeye(HandEyeInput("t", each), "pose", repeats=0).all_notes() for each in (pairs, stated)]

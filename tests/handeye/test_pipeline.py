@@ -63,7 +63,7 @@ def test_matrices_in_metres_are_pairs_of_poses():
     np.testing.assert_allclose(mixed.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
 
 
-def test_what_is_no_pairs_of_poses_is_refused():
+def test_what_is_no_pairs_of_poses_or_no_input_is_refused(poses):
     flange, board = PAIRS.base_from_flange, PAIRS.camera_from_board
     refuses("E-POSES-COUNT … camera_from_board", handeye.handeye, base_from_flange=flange, setup="eye-in-hand")
     refuses("E-OPTION-CONFLICT … no unit", handeye.handeye, PAIRS, unit="m")
@@ -72,6 +72,8 @@ def test_what_is_no_pairs_of_poses_is_refused():
     refuses("E-ARGUMENT-UNNAMED … setup=", handeye.handeye, PAIRS, "eye-in-hand")
     with fails_with("E-OPTION-VALUE … unit 'feet'"):
         handeye.handeye(base_from_flange=flange, camera_from_board=board, unit="feet")
+    refuses("E-FIELD-TYPE … given … HandEyeInput", workflows.calibrate_handeye, poses)
+    refuses("E-OPTION-VALUE … setup", workflows.read_handeye, poses, setup="in hand")
 
 
 @pytest.fixture
@@ -88,11 +90,6 @@ def written(command, tmp_path):
     return call
 
 
-def test_what_is_no_input_is_refused(poses):
-    refuses("E-FIELD-TYPE … given … HandEyeInput", workflows.calibrate_handeye, poses)
-    refuses("E-OPTION-VALUE … setup", workflows.read_handeye, poses, setup="in hand")
-
-
 def test_two_files_of_poses(written, poses, tmp_path):
     read, names = stcal.load_table(poses), [f"p{i}" for i in range(8)]
     board = read.poses("camera_from_board_")
@@ -105,13 +102,10 @@ def test_two_files_of_poses(written, poses, tmp_path):
     assert given.notes == (f"1 rows of {camera} have no partner: image p99",)
 
 
-def test_plan_handeye(written, poses):
+def test_plan_and_flips_are_those_of_the_command(written, poses):
     answer = written("plan", poses, "--count", 1)
     found = workflows.plan_handeye(workflows.read_handeye(poses), 1)
     assert json.loads(json_text(HandEyePlanFile.of(found.result, found.poses, found.joints))) == answer
-
-
-def test_without_flips(poses):
     given, said = workflows.without_flips(found := workflows.read_handeye(poses))
     assert given.pairs.camera_from_board == found.pairs.camera_from_board
     assert said.endswith("0 of 8 poses: none")

@@ -96,7 +96,7 @@ def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:
     return [folder / "images", *(word for option, name in files for word in (option, folder / name))]
 
 
-def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
+def test_dry_run_says_what_was_understood_of_times_of_names_and_of_a_file(command, tmp_path):
     names = ["100.105.png", "100.300.png", "100.6017.png", "200.5.png"]
     given = photographs(tmp_path, names, 100 + np.arange(40) * 0.02)
     code, shown, error = command(*given, "--dry-run")
@@ -107,10 +107,8 @@ def test_dry_run_says_what_was_understood_of_times(command, tmp_path):
     code, shown, error = command(*given, "--dry-run", "--time-tolerance", 100)
     assert code == 0, error
     assert "images: 4 of 4 with a pose of the robot" in shown
-
-
-def test_times_of_images_in_a_file(command, tmp_path):
-    given = photographs(tmp_path, ["a.png", "b.png", "c.png"], 100 + np.arange(40) * 0.02)
+    (tmp_path / "named").mkdir()
+    given = photographs(tmp_path / "named", ["a.png", "b.png", "c.png"], 100 + np.arange(40) * 0.02)
     times = tmp_path / "times.csv"
     times.write_text("image,time_s\na,100.105\nb.png,100.3\n")
     code, shown, error = command(*given, "--dry-run", "--image-times", times)

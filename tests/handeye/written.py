@@ -120,6 +120,13 @@ def two(folder: Path, a: str | bytes, b: str | bytes, suffix: str = "txt") -> Ar
     return ["--a", str(paths[0]), "--b", str(paths[1])]
 
 
+def columns_in_metres(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """A table with quaternions, of the inverses of both sides."""
+    inverses = pairs.base_from_flange.inverse(), pairs.camera_from_board.inverse()
+    sides = dict(zip(("flange_from_base", "board_from_camera"), inverses, strict=True))
+    return [str(table(folder / "poses.csv", sides, unit="m"))]
+
+
 def npy(folder: Path, pairs: HandEyePoses) -> Arguments:
     np.save(folder / "robot.npy", in_metres(pairs.base_from_flange))
     return ["--a", str(folder / "robot.npy"), "--b", saved(folder, pairs)]
@@ -189,6 +196,7 @@ def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
 FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "OpenCV's arrays": opencv_arrays,
     "npz": stacks,
+    "columns in metres": columns_in_metres,
     "JSON": objects,
     "MoveIt": moveit,
     "easy_handeye": easy_handeye,

@@ -1,4 +1,4 @@
-"""The same poses, written in each format, are read as the same poses; other formats are refused."""
+"""The same poses, written in each format, are read as the same poses; other formats and false pairs are refused."""
 
 from pathlib import Path
 
@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
+from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_robot
+from stcal.handeye.data.pose_pairs import inverted
 from stcal.handeye.data.pose_partners import rows_of_images
+from stcal.io.table import COVARIANCE
 from stcal.workflows.handeye_inputs import Files
 from tests.handeye.test_cli import NOISE
-from tests.handeye.written import FORMATS, REFUSED, easy_handeye, poses_file
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.handeye.written import FORMATS, REFUSED, easy_handeye, poses_file, sides_of, table
+from tests.outcome import INPUT, assert_error, refuses
+from tests.shared import written
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 7).pairs
@@ -34,11 +38,8 @@ def read(arguments, path=None):
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_poses(name, tmp_path):
     found = read(FORMATS[name](tmp_path, PAIRS))
-    for wanted, got in (
-        (PAIRS.base_from_flange, found.pairs.base_from_flange),
-        (PAIRS.camera_from_board, found.pairs.camera_from_board),
-    ):
-        assert np.abs(got.difference(wanted)).max() < ROUNDING
+    for name, wanted in sides_of(PAIRS).items():
+        assert np.abs(getattr(found.pairs, name).difference(wanted)).max() < ROUNDING
     assert len(found.understood) >= 2
     assert found.left_out == ()
 
@@ -46,8 +47,7 @@ def test_every_format_gives_the_same_poses(name, tmp_path):
 @pytest.mark.parametrize("name", REFUSED)
 def test_other_formats_are_refused_in_a_line(name, tmp_path):
     """As the robot's poses beside images, as one of two files, and as pairs."""
-    path = tmp_path / "poses"
-    path.write_text(REFUSED[name])
+    path = written(tmp_path / "poses", REFUSED[name])
     np.save(tmp_path / "b.npy", np.array([pose.matrix() for pose in PAIRS.camera_from_board])[:1])
     for call in (
         lambda: read_robot(path, Said()),
@@ -65,14 +65,12 @@ def test_names_of_rows_are_those_of_images(tmp_path):
     """Without folder and ending too, where that leaves one image and one row."""
     columns = ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
     row = "0.png,0.1,0.2,0.3,1,0,0,0\n"
-    (tmp_path / "poses.csv").write_text(f"image,{columns}\n{row}g/{row}")
-    with fails_with("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'"):
-        rows_of_images(read_robot(tmp_path / "poses.csv", Said()), ["g/0.png"])
+    twice = read_robot(written(tmp_path / "poses.csv", f"image,{columns}\n{row}g/{row}"), Said())
+    refuses("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'", rows_of_images, twice, ["g/0.png"])
     np.savez(tmp_path / "r.npz", base_from_flange=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
     found = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
     assert rows_of_images(found, ["a/0.png", "a/10.png", "a/7.png"]) == ({"a/0.png": 0, "a/10.png": 2}, ("1",), "")
-    with fails_with("E-IMAGE-NAME-AMBIGUOUS … pose 2 … 1 … a/1.png … b/1.png"):
-        rows_of_images(found, ["a/1.png", "b/1.png"])
+    refuses("E-IMAGE-NAME-AMBIGUOUS … pose 2 … 1 … a/1.png … b/1.png", rows_of_images, found, ["a/1.png", "b/1.png"])
 
 
 OWN = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
@@ -93,8 +91,7 @@ VINS = "".join(f"14036365797635558{i:02},0.1,0.2,0.{i},0.8,0.0,0.0,0.6\n" for i 
 )
 def test_tables_of_other_programs_are_read(tmp_path, text, rotation, order, names, place, turned):
     """By the order of columns, a recording of UR's RTDE, an index without a name, and VINS, by either order."""
-    (tmp_path / "r.csv").write_text(text)
-    found = read_robot(tmp_path / "r.csv", Said(rotation=rotation), order)
+    found = read_robot(written(tmp_path / "r.csv", text), Said(rotation=rotation), order)
     assert found.names == (names or found.names)
     assert found.poses.translation[0] == pytest.approx(place)
     for at, value in turned.items():
@@ -109,9 +106,7 @@ def test_tables_of_other_programs_are_read(tmp_path, text, rotation, order, name
     ],
 )
 def test_rotations_that_cannot_be_told_are_refused(tmp_path, text, said, error):
-    (tmp_path / "r.csv").write_text(text)
-    with fails_with(error):
-        read_robot(tmp_path / "r.csv", said)
+    refuses(error, read_robot, written(tmp_path / "r.csv", text), said)
 
 
 QUICK = ("--method", "pose", "--splits", 0)
@@ -122,7 +117,7 @@ def truth():
     return simulated(np.random.default_rng(5), 12, **NOISE)
 
 
-def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path, truth):
+def test_a_dry_run_says_what_it_understood_and_what_motion_is_missing_and_writes_nothing(command, tmp_path, truth):
     arguments = FORMATS["KUKA"](tmp_path, truth.pairs)
     code, shown, _ = command(*arguments, "--dry-run", "--out", tmp_path / "h.json", "--setup", "eye-in-hand")
     assert code == 0
@@ -144,9 +139,6 @@ def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path,
         "poses.csv: table; 12 poses; base_from_flange by the columns base_from_flange_…; quaternions by name; mm"
         in shown
     )
-
-
-def test_a_dry_run_says_what_motion_is_missing(command, tmp_path, truth):
     still = truth.pairs.base_from_flange.matrix()
     still[:, :3, :3] = still[0, :3, :3]
     np.savez(tmp_path / "p.npz", base_from_flange=still, camera_from_board=truth.pairs.camera_from_board.matrix())
@@ -166,3 +158,59 @@ def test_the_setup_that_a_file_states_is_taken(command, tmp_path):
     assert_error(command(*arguments, *QUICK, "--setup", "eye-in-hand"), INPUT, said)
     arguments = easy_handeye(tmp_path, truth.pairs, "")  # as its server leaves it: --setup tells
     assert command(*arguments, *QUICK, "--setup", "eye-to-hand")[0] == 0
+
+
+EIGHT = simulated(np.random.default_rng(1), 8, camera=(1e-3, 0.3))
+
+
+def test_bad_cells_and_sides_are_named(tmp_path):
+    for row, column, cell, error in (
+        (2, 0, "nan", "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
+        (5, 13, "3", "E-QUATERNION-LENGTH … line 7"),
+        (0, 8, "abc", "E-TABLE-NUMBER … 2 … camera_from_board_y_mm … 'abc'"),
+    ):
+        path = poses_file(tmp_path / "poses.csv", EIGHT, lambda rows: rows[row].__setitem__(column, cell))  # noqa: B023
+        refuses(error, read_poses, path)
+    flange, board = EIGHT.pairs.base_from_flange, EIGHT.pairs.camera_from_board
+    every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
+    for sides, fault in (({"base_from_flange": flange}, "no such columns … camera_from_board"), (every, "both … base")):
+        refuses(f"E-TABLE-COLUMN-MISSING … {fault}", read_poses, table(tmp_path / "a.csv", sides))
+
+
+def test_identical_poses_and_a_board_that_did_not_follow_are_named(tmp_path):
+    rows = [0, 1, 2, 3, 1, 5]
+    same = table(tmp_path / "poses.csv", {name: poses[rows] for name, poses in sides_of(EIGHT.pairs).items()})
+    refuses("E-POSES-IDENTICAL … line 3 and line 6", read_poses, same)
+    flange, board = EIGHT.pairs.base_from_flange, EIGHT.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
+    refuses("E-POSES-IDENTICAL … pose 4 and pose 5", HandEyePoses, flange, board)
+
+
+def test_matrices_are_checked_one_by_one():
+    flange = [p.matrix() for p in EIGHT.pairs.base_from_flange]
+    board = [p.matrix() for p in EIGHT.pairs.camera_from_board]
+    same = HandEyePoses.from_matrices(flange, board)
+    assert same.camera_from_board.translation == pytest.approx(EIGHT.pairs.camera_from_board.translation)
+    mirrored = [m.copy() for m in board]
+    mirrored[3][:3, 2] *= -1
+    refuses("E-ROTATION-IMPROPER … camera_from_board", HandEyePoses.from_matrices, flange, mirrored)
+    broken = [m.copy() for m in flange]
+    broken[1][0, 3] = np.inf
+    refuses("E-ARRAY-NOT-FINITE", HandEyePoses.from_matrices, broken, board)
+    refuses("E-POSES-COUNT … 8 … 7", HandEyePoses.from_matrices, flange, board[:7])
+    refuses("E-POSES-COUNT … 7 … 8", HandEyePoses.from_matrices, flange[:7], board)
+
+
+def test_covariances_are_read_and_turned_over(tmp_path):
+    """The inverse's covariance, given under the inverse's name, comes back as the pose's own."""
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(8, 6, 6)) * np.repeat([1e-3, 0.3], 3)[:, None]
+    covariance = root @ np.swapaxes(root, 1, 2)
+    board = EIGHT.pairs.camera_from_board
+    i, j = np.triu_indices(6)
+    _, inverse, _ = inverted(board, covariance, None)
+    extra = {f"board_from_camera_{name}": inverse[:, i[k], j[k]] for k, name in enumerate(COVARIANCE)}
+    sides = {"base_from_flange": EIGHT.pairs.base_from_flange, "board_from_camera": board.inverse()}
+    pairs = read_poses(table(tmp_path / "poses.csv", sides, **extra))
+    assert pairs.camera_from_board_covariance == pytest.approx(covariance, rel=1e-6, abs=1e-10)
+    assert pairs.base_from_flange_covariance is None
+    assert pairs[2:4].camera_from_board_covariance.shape == (2, 6, 6)

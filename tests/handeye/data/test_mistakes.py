@@ -15,7 +15,8 @@ from stcal.handeye.data.pose_files import read_pairs, read_robot, read_two
 from stcal.handeye.data.pose_partners import partners
 from stcal.workflows.handeye_inputs import Files
 from tests.handeye.written import easy_handeye, in_metres, message, moveit, tum
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
+from tests.shared import written
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 5).pairs
@@ -88,6 +89,7 @@ PROMISE = io.BytesIO()
 np.lib.format.write_array_header_1_0(PROMISE, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 4, 4)})
 DAMAGED = archived(saved(GOOD))
 
+LARGER, IN_METRES = [1.01, 1.01, 1.01, 1], np.array([[1, 1, 1, 1e-3]] * 3 + [[1] * 4])
 EULER = "x_mm,y_mm,z_mm"
 TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
 
@@ -95,17 +97,11 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
-        (
-            saved(changed(2, lambda m: m * [1.01, 1.01, 1.01, 1])),
-            ["pose 3", "not a rotation", "1.01", "1 ± 0.001 needed"],
-        ),
+        (saved(changed(2, lambda m: m * LARGER)), ["pose 3", "not a rotation", "1.01", "1 ± 0.001 needed"]),
         (saved(changed(2, lambda m: m * [1, -1, 1, 1])), ["pose 3", "a reflection", "change the sign of one axis"]),
         (saved(changed(1, np.transpose)), ["pose 2", "last row", "0 0 0 1 needed", "transposed"]),
         (saved(changed(4, lambda m: m * [1, 1, 1, np.nan])), ["pose 5", "not finite"]),
-        (
-            saved(changed(0, lambda m: m * ([[1, 1, 1, 1e-3]] * 3 + [[1] * 4]))),
-            ["pose 1 is", "two units", "--length-unit"],
-        ),
+        (saved(changed(0, lambda m: m * IN_METRES)), ["pose 1 is", "two units", "--length-unit"]),
         (saved(GOOD[:, :3]), ["no poses", "4×4 matrices", "TUM", "needed"]),
         (saved(np.zeros((0, 4, 4))), ["shape (0, 4, 4); numbers needed"]),
         (PROGRAM, ["not a file of NumPy (Object arrays"]),
@@ -137,16 +133,13 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
     ],
 )
 def test_what_is_wrong_with_a_file_is_named(tmp_path, content, parts):
-    path = tmp_path / "poses"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    said = refused(path)
+    said = refused(written(tmp_path / "poses", content))
     for part in parts:
         assert part in said
 
 
-def test_bad_conventions_are_named(tmp_path):
-    path = tmp_path / "poses.csv"
-    path.write_text(f"{EULER},a,b,c\n1,2,300,0.1,0.2,0.3\n")
+def test_bad_conventions_and_options_are_named(tmp_path):
+    path = written(tmp_path / "poses.csv", f"{EULER},a,b,c\n1,2,300,0.1,0.2,0.3\n")
     for rotation, error in (
         ("kuka", "E-OPTION-VALUE … --rotation … kuka"),
         ("xyz-grad", "E-OPTION-VALUE"),
@@ -154,9 +147,6 @@ def test_bad_conventions_are_named(tmp_path):
         ("ZYX", "E-ROTATION-AMBIGUOUS … 0.3 … --rotation … ZYX … ZYX"),
     ):
         refuses(error, read_robot, path, Said(rotation=rotation))
-
-
-def test_bad_options_are_named():
     for error, *options in (
         ("E-OPTION-VALUE … --length-unit feet … mm, m", [], ["feet"], []),
         ("E-OPTION-VALUE … --length-unit tool=m … robot= or camera=", [], ["tool=m"], []),
@@ -170,33 +160,29 @@ def test_bad_options_are_named():
 def test_a_direction_that_the_file_states_is_not_changed(tmp_path):
     np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=PAIRS.camera_from_board.matrix())
     said = Said(frames=("base_from_flange",))
-    assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in refused(
-        tmp_path / "p.npz", said, read_pairs
-    )
+    told = refused(tmp_path / "p.npz", said, read_pairs)
+    assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in told
     np.save(tmp_path / "p.npy", GOOD)
     turned = read_robot(tmp_path / "p.npy", Said(frames=("flange_from_base",)))
     assert turned.poses.inverse().translation == pytest.approx(GOOD[:, :3, 3])
 
 
-def test_the_file_of_the_other_side_is_named(tmp_path):
+def test_the_file_of_the_other_side_and_samples_without_one_side_are_named(tmp_path):
     (arguments,) = easy_handeye(tmp_path, PAIRS)
     np.save(tmp_path / "p.npy", GOOD)
-    (tmp_path / "c.json").write_text(json.dumps({"camera_from_board": GOOD.tolist()}))
-    assert "of camera_from_board, base_from_flange needed here" in refused(tmp_path / "c.json")
+    camera = written(tmp_path / "c.json", json.dumps({"camera_from_board": GOOD.tolist()}))
+    assert "of camera_from_board, base_from_flange needed here" in refused(camera)
     assert "give the robot's file as --a and the camera's as --b" in refused(tmp_path / "p.npy", call=read_pairs)
     assert len(read_robot(tmp_path / "demo.samples", Said())) == len(PAIRS)  # both sides: the robot's are taken
     assert arguments.endswith("demo.samples")
-
-
-def test_samples_without_one_side_are_named(tmp_path):
     (path,) = moveit(tmp_path, PAIRS)
     text = Path(path).read_text()
-    broken = tmp_path / "broken.yaml"
-    broken.write_text(text.replace("object_wrt_sensor", "object", 2).replace("object", "object_wrt_sensor", 1))
+    other = text.replace("object_wrt_sensor", "object", 2).replace("object", "object_wrt_sensor", 1)
+    broken = written(tmp_path / "broken.yaml", other)
     assert "pose 2: object_wrt_sensor is missing, which pose 1 has" in refused(broken, call=read_pairs)
     samples = [{"robot": message(GOOD[0]), "tracking": message(GOOD[0])}, {"robot": message(GOOD[1])}]
-    (tmp_path / "s.json").write_text(json.dumps({"samples": samples}))
-    assert "sample 2: robot and tracking needed" in refused(tmp_path / "s.json", call=read_pairs)
+    path = written(tmp_path / "s.json", json.dumps({"samples": samples}))
+    assert "sample 2: robot and tracking needed" in refused(path, call=read_pairs)
 
 
 def test_rows_of_two_files_that_do_not_fit(tmp_path):
@@ -204,16 +190,13 @@ def test_rows_of_two_files_that_do_not_fit(tmp_path):
     np.save(tmp_path / "b.npy", PAIRS.camera_from_board.matrix()[:4])
     refuses("E-POSES-COUNT … 5 … 4", read_two, tmp_path / "a.npy", tmp_path / "b.npy", Said(), "image")
     _, a, _, b = tum(tmp_path, PAIRS)
-    with fails_with("E-POSES-UNNAMED … b.npy … 100.5000"):
-        read_two(tmp_path / "robot.txt", tmp_path / "b.npy", Said(), "image")
-    late = [f"9{row}" if row[0] != "#" else row for row in Path(b).read_text().splitlines()]
-    (tmp_path / "late.txt").write_text("\n".join(late))
-    with fails_with("E-POSES-UNMATCHED … 9100.5 … 8996 … robot.txt … 0.02"):
-        read_two(tmp_path / "robot.txt", tmp_path / "late.txt", Said(), "image")
-    assert a.endswith("robot.txt")
+    refuses("E-POSES-UNNAMED … b.npy … 100.5000", read_two, Path(a), tmp_path / "b.npy", Said(), "image")
     lines = Path(b).read_text().splitlines()
-    (tmp_path / "fewer.txt").write_text("\n".join(lines[:3] + lines[4:]))
-    told = read_two(tmp_path / "robot.txt", tmp_path / "fewer.txt", Said(), "image")
+    late = written(tmp_path / "late.txt", "\n".join([lines[0], *(f"9{row}" for row in lines[1:])]))
+    said = "E-POSES-UNMATCHED … 9100.5 … 8996 … robot.txt … 0.02"
+    refuses(said, read_two, Path(a), late, Said(), "image")
+    fewer = written(tmp_path / "fewer.txt", "\n".join(lines[:3] + lines[4:]))
+    told = read_two(Path(a), fewer, Said(), "image")
     assert (told.left_out, len(told.pairs)) == ((("102.5000", "in robot.txt alone"),), 4)
 
 
@@ -239,8 +222,7 @@ def test_names_that_mean_the_same(first, second, rows, how):
 @pytest.mark.parametrize(("head", "name"), [("u,v,w,RX,RY,RZ", "p.csv"), ("u;v;w;RX;RY;RZ", "p.txt")])
 def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_path, head, name):
     between = ";" if ";" in head else ","
-    path = tmp_path / name
-    path.write_text(f"{head}\n{between.join('123456')}\n")
+    path = written(tmp_path / name, f"{head}\n{between.join('123456')}\n")
     said = Said(rotation="ur-rotvec")
     refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", Files(path, second=path, statements=said).read)

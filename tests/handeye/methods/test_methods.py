@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS, HandEyeOptions, HandEyePoses, Noise
 from stcal.handeye.data.pose_pairs import FRAMES, SETUPS, Loop, Motions, poses_with_log
-from stcal.handeye.methods.closed_form import (
-    AX_XB,
-    Bounds,
-    EvolutionOptions,
-    Objective,
-    evolve,
-    robust,
-)
+from stcal.handeye.methods.closed_form import AX_XB, Bounds, EvolutionOptions, Objective, evolve, robust
 from tests.levels import sampled
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import disturbed, handeye, simulated

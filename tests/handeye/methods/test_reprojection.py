@@ -82,9 +82,8 @@ def test_a_view_of_another_board_is_left_out():
     view, bent = truth.views.views[4], truth.views.views[2].xy_px.copy()
     bent[10] += [30, -20]  # one bad corner does no harm
     views, _ = with_view(truth, 2, View(view.xyz_board, bent))
-    views, pairs = with_view(
-        replace(truth, views=views), 4, View(view.xyz_board, view.xy_px[::-1])
-    )  # from the other end
+    from_the_other_end = View(view.xyz_board, view.xy_px[::-1])
+    views, pairs = with_view(replace(truth, views=views), 4, from_the_other_end)
     found = handeye(pairs, views=views)
     assert np.flatnonzero(found.outliers).tolist() == [4]
     assert np.isnan(found.reprojection.rms_px(4))

@@ -30,9 +30,8 @@ def of_views() -> Outcome:
     result = handeye(truth.pairs, truth.setup, None, truth.views, options)
     result = replace(result, notes=("a note with <markup> & more",))
     held_out = cross_validate(truth.pairs, truth.setup, None, truth.views, options, splits(10, 2, 2))
-    given = HandEyeInput(
-        "images & poses", truth.pairs, truth.views, pitch_mm=25.0, left_out=(("x<1>.png", "no board"),)
-    )
+    left_out = (("x<1>.png", "no board"),)
+    given = HandEyeInput("images & poses", truth.pairs, truth.views, pitch_mm=25.0, left_out=left_out)
     return Outcome(given, result, held_out)
 
 

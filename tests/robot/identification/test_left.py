@@ -76,11 +76,15 @@ def test_a_cause_is_named_once(kind, joint, of, what):
     assert f"residuals go with {what}: " in finding.sentence()
 
 
-def test_a_coupling_of_the_wrist_is_no_gravity():
-    """A hundredth of joint 5 in joint 6."""
+def test_a_coupling_of_the_wrist_is_no_gravity_and_two_causes_are_two_findings():
+    """A hundredth of joint 5 in joint 6; and joints 1 and 3."""
     finding = left_of(*bent(4, 60, {6: lambda q, _: 0.01 * q[:, 4]}), "pose")[0]
     assert finding.what.startswith("the value of joint 5, along the motion of joint 6, as of a coupling")
     assert finding.share > 0.9
+    both = {1: lambda q, _: 3e-4 * twice(q[:, 0]), 3: lambda q, _: 3e-4 * np.cos(q[:, 2])}
+    found = left_of(*bent(7, 200, both), "position")
+    assert {finding.joint for finding in found} == {1, 3}
+    assert found[0].share > found[1].share
 
 
 def test_the_effect_is_what_was_put_in():
@@ -93,13 +97,6 @@ def test_the_effect_is_what_was_put_in():
     assert 0.7 * put_in < finding.effect_mm < put_in
     assert 0.3 < finding.share < 0.95
     assert finding.sentence().endswith("p < 0.001")
-
-
-def test_two_causes_are_two_findings():
-    both = {1: lambda q, _: 3e-4 * twice(q[:, 0]), 3: lambda q, _: 3e-4 * np.cos(q[:, 2])}
-    found = left_of(*bent(7, 200, both), "position")
-    assert {finding.joint for finding in found} == {1, 3}
-    assert found[0].share > found[1].share
 
 
 JUMP = Rigid.exp([0, 0, 2e-3, 0.6, -0.8, 0])
@@ -133,7 +130,7 @@ def test_an_instrument_that_moved_is_located_and_a_station_proposed(row, kind):
     assert finding.line == data.lines[row]
 
 
-def test_a_target_that_slipped_and_a_joint_that_lost_its_zero_are_told_apart():
+def test_a_target_that_slipped_a_joint_that_lost_its_zero_and_a_drift_are_told_apart():
     true, data = simulated(13, 60, targets=("a", "b"))
     later = np.arange(60) >= 30
     slipped = np.array([each == "b" for each in data.targets]) & later
@@ -146,9 +143,6 @@ def test_a_target_that_slipped_and_a_joint_that_lost_its_zero_are_told_apart():
     finding, *_ = left_of(true, lost, "pose")
     assert (finding.joint, finding.line) == (4, data.lines[30])
     assert finding.effect_rad == pytest.approx(2e-3, rel=0.2)
-
-
-def test_a_drift_is_no_jump():
     true, data = simulated(14, 60)
     along = np.linspace(0, 1, 60)[:, None]
     drifted = replace(data, positions=data.points() + along * [0.8, 0.6, 0])

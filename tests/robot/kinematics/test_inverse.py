@@ -140,7 +140,7 @@ def test_out_of_reach_is_named_with_what_remains():
     np.testing.assert_allclose(found.error_mm[1], off(robot, Poses(poses.rotation, at)[1:2], found.q[1:2])[0])
 
 
-def test_what_only_limits_forbid_is_named():
+def test_what_only_limits_forbid_is_named_and_turns_follow_the_reference_as_far_as_they_go():
     robot = mh80()
     q = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     narrow = replace(robot, joints=(Joint("revolute", 0.3, 0.5), *(Joint("revolute", v - 0.2, v + 0.2) for v in q[1:])))
@@ -149,10 +149,7 @@ def test_what_only_limits_forbid_is_named():
     assert within(narrow, found.q)
     assert 1 < found.error_mm[0] < 0.4 * 2100
     assert inverse(robot, forward(robot, q), q).status == ("reached",)
-
-
-def test_turns_follow_the_reference_as_far_as_limits_go():
-    robot = mh80()  # its fourth and sixth joint turn ± 360°
+    # The fourth and the sixth joint turn ± 360°.
     q = np.array([0.1, 0.2, 0.3, 0.4, 0.9, 0.6])
     near = q + np.array([0, 0, 0, 0, 0, -2 * np.pi])
     np.testing.assert_allclose(inverse(robot, forward(robot, q), near).q[0], near, atol=1e-8)
@@ -181,7 +178,7 @@ def test_singular_poses(name):
     assert len(branches(robot, forward(robot, wrist)[0])) > 0
 
 
-def test_scara_reaches_what_four_joints_can():
+def test_scara_reaches_what_four_joints_can_and_states_the_rest_of_tilted_axes():
     robot = scara()
     q = joint_vectors(robot, 10, np.random.default_rng(3), 0.8)
     q[:, 2] = np.abs(q[:, 2])
@@ -190,10 +187,6 @@ def test_scara_reaches_what_four_joints_can():
     np.testing.assert_allclose(found.q, q, atol=1e-6)
     left = branches(robot, forward(robot, np.array([0.4, 0.9, 80.0, -0.3]))[0])
     np.testing.assert_allclose(np.sort(left.q[:, 1]), [-0.9, 0.9], atol=1e-8)  # elbow left and right
-
-
-def test_scara_of_tilted_axes_reaches_the_position_and_states_the_rest():
-    robot = scara()
     q = np.array([[0.4, 0.9, 80.0, -0.3]])
     real = made(robot, np.random.default_rng(7))
     found = inverse(real, forward(robot, q), q)
@@ -217,16 +210,13 @@ def test_redundant_arm_needs_a_reference_and_stays_near_it():
     refuses("E-ROBOT-REDUNDANT", branches, robot, forward(robot, q)[0])
 
 
-def test_without_reference_a_path_stays_in_its_branch():
+def test_without_reference_a_path_stays_in_its_branch_and_a_bad_one_is_named():
     robot = ARMS["made"]
     ends = np.array([[0.2, 0.3, -0.4, 0.5, 0.6, 0.7], [0.5, 0.5, -0.2, 0.8, 0.9, 0.4]])
     q = ends[0] + np.linspace(0, 1, 10)[:, None] * (ends[1] - ends[0])
     found = inverse(robot, forward(robot, q))
     assert set(found.status) == {"reached"}
     assert np.abs(np.diff(found.q, axis=0)).max() < 0.2
-
-
-def test_bad_reference_is_named():
     pose = forward(mh80(), np.zeros(6))
     refuses("E-ARRAY-SHAPE … (5,) … 6 … 1 … 6", inverse, mh80(), pose, np.zeros(5))
     refuses("E-ARRAY-NOT-FINITE", inverse, mh80(), pose, np.full(6, np.nan))

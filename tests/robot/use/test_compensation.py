@@ -21,6 +21,7 @@ from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv, on_targets, robots_apart
 from tests.levels import sampled
 from tests.outcome import refuses
+from tests.shared import write_rows
 from tests.support.arms import elastic, scara, targets
 
 pytestmark = pytest.mark.slow
@@ -42,9 +43,7 @@ class Case:
         self.poses = forward(self.nominal, self.q)
 
     def write(self, header: Sequence[str], rows: list[list[str]]) -> Path:
-        path = self.folder / "targets.csv"
-        path.write_text("\n".join(",".join(r) for r in [header, *rows]) + "\n")
-        return path
+        return write_rows(self.folder / "targets.csv", header, rows)
 
     def read(self, header: Sequence[str], rows: list[list[str]]) -> Targets:
         return read_targets(self.write(header, rows), self.real)
@@ -61,7 +60,7 @@ def case(tmp_path):
     return Case(tmp_path)
 
 
-def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
+def test_joint_values_command_what_the_nominal_robot_makes_of_them_and_poses_need_none(case):
     result = compensate(case.real, targets(None, case.q), case.nominal)
     reached = forward(case.real, result.found.q)
     assert result.found.usable.all()
@@ -73,9 +72,6 @@ def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
     assert 0.5 < expected.mean() < 5
     # The same branch: others are about π away, and at the wrist 0.5 mrad over 8 mrad of bend are 0.1 rad.
     assert np.abs(result.found.q - case.q).max() < 1
-
-
-def test_poses_alone_need_no_nominal_robot(case):
     result = compensate(case.real, targets(case.poses[:FEW]))
     assert result.found.usable.all()
     assert len(result.before_mm) == 0
@@ -222,15 +218,12 @@ def test_each_row_is_compensated_for_its_payload(case):
     assert [row["payload_kg"] for row in table[:2]] == ["0", "80"]
 
 
-def test_files_that_are_exchanged_or_the_same_are_told(case):
+def test_files_or_axes_that_are_exchanged_the_same_file_and_radians_without_poses_are_told(case):
     given = targets(None, case.q[:1])
     good = compensate(case.real, given, case.nominal).notes()
     assert not any("as drawn" in note or "are the same" in note for note in good)
     assert "as if they were exchanged" in compensate(case.nominal, given, case.real).notes()[0]
     assert "are the same, so that nothing is compensated" in compensate(case.real, given, case.real).notes()[0]
-
-
-def test_axes_that_are_exchanged_and_radians_without_poses_are_told(case):
     q, exchanged = case.q[:FEW], Poses(case.poses.rotation[:FEW], case.poses.translation[:FEW][:, [1, 0, 2]])
     refuses("E-ROBOT-MISMATCH … if x, y, z were y, x, z", compensate, case.real, targets(exchanged, q), case.nominal)
     notes = compensate(case.real, targets(None, np.radians(q)), case.nominal).notes()
@@ -279,16 +272,13 @@ def test_good_targets_and_arms_as_made_pass(make, count, share):
         assert robots_apart(moved, nominal) == ""
 
 
-def test_one_orientation_fits_in_every_convention():
+def test_one_orientation_fits_in_every_convention_and_joint_values_that_lead_elsewhere_are_said():
     """The tool points down in all rows, whatever the last joint's value is said to be."""
     nominal = arm(1)
     q, poses = commanded(nominal, 8, 1)
     down = np.repeat(Rotation.from_euler("xz", [180, 40], degrees=True).as_matrix()[None], 8, axis=0)
     _, notes = on_targets(nominal, targets(Poses(down, poses.translation), q))
     assert [note.split(",")[0] for note in notes] == ["joint values of 8 of 8 rows"]
-
-
-def test_joint_values_that_lead_elsewhere_are_said():
     nominal = arm(2)
     q, poses = commanded(nominal, 6, 2)
     other = q.copy()
@@ -310,20 +300,14 @@ def test_targets_in_the_arms_foot_are_said(factor, words, count):
         assert words in notes[0]
 
 
-def test_a_nominal_robot_of_another_arm_is_refused():
+def test_a_nominal_robot_of_another_arm_is_refused_and_files_unusually_far_apart_are_said():
+    """Zeros off by 1° in all joints: 2 % of the reach."""
     nominal = arm(4)
     real = made(nominal, np.random.default_rng(4))
     q, poses = commanded(nominal, 3, 4)
     for given in (targets(poses, q), targets(poses), targets(None, q)):
         refuses("E-ROBOT-MISMATCH", compensate, real, given, arm(5))
-
-
-def test_files_unusually_far_apart_are_said():
-    """Zeros off by 1° in all joints: 2 % of the reach."""
-    nominal = arm(4)
     off = replace(nominal, rows=tuple(replace(r, theta=r.theta + np.radians(1.0)) for r in nominal.rows))
-    q, poses = commanded(nominal, 3, 4)
     notes = compensate(off, targets(poses, q), nominal).notes()
     assert "more than arms are off their drawing (1% of the reach): are both files of this robot?" in notes[0]
-    real = made(nominal, np.random.default_rng(4))
     assert not any("apart" in note for note in compensate(real, targets(poses, q), nominal).notes())

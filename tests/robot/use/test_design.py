@@ -115,15 +115,12 @@ def test_same_seed_same_poses_within_limits_and_box():
     np.testing.assert_allclose(first.poses.translation, at)
 
 
-def test_what_no_pose_shows_is_left_out_and_told():
+def test_what_no_pose_shows_is_left_out_and_told_and_mistakes_are_named():
     """A tool on the last axis: two tilts of that axis look like two shifts."""
     result = design(mh80(), DesignOptions(count=20, candidates=200))
     assert (result.seen, result.parameters) == (25, 27)
     assert result.chosen.o3 > 0
     assert "2 of 27 combinations of parameters move nothing" in design_report(result, mh80()).text()
-
-
-def test_mistakes_are_named():
     refuses("E-DESIGN-FEW … 8 … 3 … 27 … 9", design, ARM, DesignOptions(count=8, candidates=100))
     refuses("E-DESIGN-OPTIONS", DesignOptions, count=50, candidates=50)
     refuses("E-DESIGN-OPTIONS", DesignOptions, box=(0, 0, 0, 1, 1, -1))

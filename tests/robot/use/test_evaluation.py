@@ -30,7 +30,7 @@ def seen(robot: Robot, seed: int, count: int = 40, poses: bool = False, **noise)
     return data if poses else replace(data, rotations=None)
 
 
-def test_figures_by_hand():
+def test_figures_by_hand_and_files_by_their_names():
     true = arm()
     data = seen(true, 2, sigma_mm=0.0)
     off = np.zeros((40, 3))
@@ -40,6 +40,9 @@ def test_figures_by_hand():
     assert found.residuals == pytest.approx(off, abs=1e-9)
     rms = np.sqrt(0.01 * (39 * 40 * 79 / 6) / 40)
     assert astuple(found.position_mm) == pytest.approx((40, 1.95, 1.95, rms, 0.95 * 3.9, 3.9))
+    assert names_of([Path("a/robot.toml"), Path("a/made.toml")]) == ["robot", "made"]
+    assert names_of([Path("a/robot.toml"), Path("b/robot.toml")]) == ["a/robot.toml", "b/robot.toml"]
+    refuses("E-OPTION-REPEATED", names_of, [Path("a.toml"), Path("a.toml")])
 
 
 def test_base_and_tool_are_fitted_by_the_robots_own_axes_and_the_better_robot_is_named_with_its_error():
@@ -165,12 +168,6 @@ def test_another_arm_is_refused_in_one_line():
     refuses("E-IDENTIFY-MISFIT", evaluate, {"a": mh80()}, data, "none")
     refuses("E-ROBOT-NO-TOOL … 'ball'", evaluate, {"a": arm()}, replace(data, targets=("ball",) * 40), "base")
     refuses("E-IDENTIFY-FEW … 3 … position … 9 … 9 … base and tool", evaluate, {"a": arm()}, data[:3])
-
-
-def test_files_are_called_by_their_names():
-    assert names_of([Path("a/robot.toml"), Path("a/made.toml")]) == ["robot", "made"]
-    assert names_of([Path("a/robot.toml"), Path("b/robot.toml")]) == ["a/robot.toml", "b/robot.toml"]
-    refuses("E-OPTION-REPEATED", names_of, [Path("a.toml"), Path("a.toml")])
 
 
 def test_identify_and_verify_read_what_was_written(tmp_path):

@@ -11,6 +11,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.robot_report import verification_report
 from stcal.robot.use.evaluation import MeasuredPoses, Verification, VerificationFile, read_measured, verify
 from tests.outcome import refuses
+from tests.shared import written
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
@@ -26,10 +27,8 @@ def measured(name: str) -> np.ndarray:
     return MOVED @ (COMMANDED + along * np.array(SHIFTS[name])[:, None])
 
 
-def written(folder: Path, lines: list[str], head: str = HEAD) -> Path:
-    path = folder / "measured.csv"
-    path.write_text("\n".join([head, *lines]) + "\n")
-    return path
+def read(folder: Path, lines: list[str], head: str = HEAD) -> MeasuredPoses:
+    return read_measured(written(folder / "measured.csv", "\n".join([head, *lines]) + "\n"))
 
 
 def lines_of(name: str, leave_out: int | None = None) -> list[str]:
@@ -42,7 +41,7 @@ def lines_of(name: str, leave_out: int | None = None) -> list[str]:
 
 
 def test_figures_by_hand(tmp_path):
-    result = verify(read_measured(written(tmp_path, lines_of("before") + lines_of("after"))))
+    result = verify(read(tmp_path, lines_of("before") + lines_of("after")))
     before, after = result.sets
     np.testing.assert_allclose(before.error_mm, [0.3, -0.4, 0.2, 0.5], atol=1e-9)
     np.testing.assert_allclose(result.distance_mm, [30, 40, 50, 100])
@@ -61,38 +60,35 @@ def test_figures_by_hand(tmp_path):
     assert "71.4 %" in text
 
 
-def test_a_missing_pose_is_named_and_left_out_of_all(tmp_path):
-    result = verify(read_measured(written(tmp_path, lines_of("before") + lines_of("after", leave_out=2))))
+def test_a_missing_pose_is_named_and_left_out_of_all_and_poses_by_name_stand_in_any_order(tmp_path):
+    result = verify(read(tmp_path, lines_of("before") + lines_of("after", leave_out=2)))
     assert result.poses == ("1", "2", "4", "5")
     assert result.missing == {"before": (), "after": ("3",)}
     assert "set after: missing poses, left out of all sets (1): 3" in result.warnings()
     np.testing.assert_allclose(result.sets[0].error_mm, [0.3, 0.2, 0.5], atol=1e-9)
-
-
-def test_poses_by_name_in_any_order(tmp_path):
     head = "pose," + HEAD
     names = ["a", "b", "c", "d", "e"]
     before = [f"{n},{row}" for n, row in zip(names, lines_of("before"), strict=True)]
     after = [f"{n},{row}" for n, row in zip(names, lines_of("after"), strict=True)][::-1]
-    result = verify(read_measured(written(tmp_path, before + after, head)))
+    result = verify(read(tmp_path, before + after, head))
     np.testing.assert_allclose(result.sets[1].error_mm, [0.1, -0.1, 0.2, 0.0], atol=1e-9)
-    twice = verify(read_measured(written(tmp_path, [*lines_of("before"), lines_of("before")[0]])))
+    twice = verify(read(tmp_path, [*lines_of("before"), lines_of("before")[0]]))
     assert len(twice.poses) == 6  # without names the same command twice is two poses
     assert twice.sets[0].error_mm[-1] == pytest.approx(0, abs=1e-9)
-    refuses("E-TABLE-ROW-REPEATED … 7 … before … 2", read_measured, written(tmp_path, [*before, before[0]], head))
+    refuses("E-TABLE-ROW-REPEATED … 7 … before … 2", read, tmp_path, [*before, before[0]], head)
     moved = [row.replace("after,30", "after,31") for row in after]
-    refuses("E-VERIFY-COMMANDED … 1 … before … after", verify, read_measured(written(tmp_path, before + moved, head)))
+    refuses("E-VERIFY-COMMANDED … 1 … before … after", verify, read(tmp_path, before + moved, head))
 
 
 def test_too_few_and_other_units_are_named(tmp_path):
-    refuses("E-VERIFY-FEW … 2 … before", verify, read_measured(written(tmp_path, lines_of("before")[:2])))
-    inches = written(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
-    [warning] = verify(read_measured(inches)).warnings()
+    refuses("E-VERIFY-FEW … 2 … before", verify, read(tmp_path, lines_of("before")[:2]))
+    inches = read(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
+    [warning] = verify(inches).warnings()
     assert "times the commanded ones; check units" in warning
-    assert verify(read_measured(written(tmp_path, lines_of("before")))).warnings() == []
+    assert verify(read(tmp_path, lines_of("before"))).warnings() == []
     still = [f"before,1,2,3,{i},0,0" for i in range(4)]
-    refuses("E-VERIFY-ALIKE", verify, read_measured(written(tmp_path, still)))
-    refuses("E-TABLE-COLUMN-MISSING … commanded_x_mm", read_measured, written(tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm"))
+    refuses("E-VERIFY-ALIKE", verify, read(tmp_path, still))
+    refuses("E-TABLE-COLUMN-MISSING … commanded_x_mm", read, tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm")
 
 
 @pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
