@@ -52,17 +52,13 @@ def test_corners_out_of_focus(sharp, blur_px, most_px):
     assert np.median(error / sigma) < 2.4  # twice the median length of two coordinates
 
 
-def test_blurred_corners_have_larger_sigma(sharp):
-    """The right half out of focus."""
+def test_blurred_corners_have_larger_sigma_and_a_hidden_one_is_left_out(sharp):
+    """The right half out of focus; and under a grey rectangle with a checkered edge, from which no corner is taken."""
     seen, middle = sharp.copy(), 600
     seen[:, middle:] = cv2.GaussianBlur(sharp, (0, 0), 3.0)[:, middle:]
     view = find_charuco(seen, "a", BOARD)
     sigma, right = np.sqrt(np.trace(view.covariance_px2, axis1=1, axis2=2) / 2), view.xy_px[:, 0] > middle + 10
     assert np.median(sigma[right]) > 1.5 * np.median(sigma[~right])
-
-
-def test_a_hidden_corner_is_left_out(sharp):
-    """A grey rectangle with a checkered edge lies on the board: no corner is taken from it."""
     hidden = sharp.copy()
     whole = find_charuco(sharp, "a", BOARD)
     x, y = np.rint(whole.xy_px[len(whole) // 2]).astype(int)

@@ -10,7 +10,8 @@ from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of, known_dictionary, of_opencv
 from stcal.boards.tags import find_tags
 from stcal.geometry.plane import apply_homography
-from tests.outcome import fails_with, refuses
+from tests.outcome import refuses
+from tests.shared import written
 from tests.support.areas import warped
 
 CELLS = {
@@ -79,25 +80,21 @@ def installed(monkeypatch):
 @pytest.mark.parametrize("family", ["tagStandard41h12", "TAGCIRCLE21H7", "tag_standard_41h12"])
 def test_without_the_package_its_extra_is_offered(installed, tmp_path, family):
     installed(None)
-    (tmp_path / "b.toml").write_text(LAYOUT.replace("TagStandard41h12", family))
-    with fails_with("E-KEY-VALUE … dictionary … pip install 'stereo-target-calibration[apriltag]' … tag36h11"):
-        load_flat_board(tmp_path / "b.toml")
+    path = written(tmp_path / "b.toml", LAYOUT.replace("TagStandard41h12", family))
+    package = "pip install 'stereo-target-calibration[apriltag]'"
+    refuses(f"E-KEY-VALUE … dictionary … {package} … tag36h11", load_flat_board, path)
 
 
-def test_tags_of_a_bundle_of_such_a_family_stand_as_printed(installed, tmp_path):
+def test_families_are_known_by_name_and_tags_of_their_bundles_stand_as_printed(installed, tmp_path):
     installed(True)
     bundle = "tag_bundles: [{name: one, layout: [{id: 3, size: 0.04, x: 0.1, y: 0.02, z: 0, qw: 1}]}]\n"
-    (tmp_path / "tags.yaml").write_text("tag_family: tagStandard41h12\n" + bundle)
-    layout = load_flat_board(tmp_path / "tags.yaml")  # Y of apriltag_ros goes up
+    path = written(tmp_path / "tags.yaml", "tag_family: tagStandard41h12\n" + bundle)
+    layout = load_flat_board(path)  # Y of apriltag_ros goes up
     np.testing.assert_allclose(layout.corners_mm[0], [[80, -40], [120, -40], [120, 0], [80, 0]], atol=1e-9)
-
-
-def test_families_are_known_by_name(installed, tmp_path):
-    installed(True)
-    (tmp_path / "b.toml").write_text(LAYOUT)
-    assert load_flat_board(tmp_path / "b.toml").tags == (("tagStandard41h12", 3),)
-    (tmp_path / "b.toml").write_text(LAYOUT.replace("id = 3", "id = 2115"))
-    refuses("E-TAG-ID-RANGE … 2115 … tagStandard41h12 has 0 … 2114", load_flat_board, tmp_path / "b.toml")
+    path = written(tmp_path / "b.toml", LAYOUT)
+    assert load_flat_board(path).tags == (("tagStandard41h12", 3),)
+    wrong = written(path, LAYOUT.replace("id = 3", "id = 2115"))
+    refuses("E-TAG-ID-RANGE … 2115 … tagStandard41h12 has 0 … 2114", load_flat_board, wrong)
     with pytest.raises(ValueError, match="only a layout of tags"):
         of_opencv("tagStandard41h12")
     refuses("E-TAG-DICTIONARY … tagStandard41h12 … not drawn here", dictionary_of, "tagStandard41h12")

@@ -15,6 +15,7 @@ from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.boards.target_file import load_boards
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, reference_board
 from stcal.errors import InputError
+from tests.shared import written
 
 APRILGRID = 'type = "aprilgrid"\nrows = 6\ncolumns = 7\ntag_mm = 80.0\nspacing = 0.3\n'
 ASYMMETRIC = (
@@ -22,6 +23,7 @@ ASYMMETRIC = (
 )
 HEXAGONAL = ASYMMETRIC.replace("asymmetric", "hexagonal").replace("rows = 11", "rows = 9")
 DOTS = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
+CIRCLES, RINGS = AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark"), ((0, 3), (1, 2))
 WITH_CORNER = [BoardDesign(3, 4, 12.5, 3.0, "dark", 0.02, place, 4.5) for place in ((0, 3), (2, 0))]
 KALIBR = {
     "aprilgrid": "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.08\ntagSpacing: 0.3\n",
@@ -37,28 +39,16 @@ IN_A_SET = CHARUCO.replace("type", "[[board]]\ntype")
 BESIDE = "x_mm = 200.0\ny_mm = 0.0\nz_mm = 50.0\nrpy_deg = [0.0, 90.0, 0.0]\n"
 
 
-def written(folder, text, name="board.toml"):
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
 @pytest.mark.parametrize(
     ("text", "board"),
     [
         ('type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\n', ChessboardDesign(5, 8, 20.0)),
         (CHARUCO, CharucoDesign(6, 8, 20.0, 10.0, "DICT_5X5_50")),
         (APRILGRID, AprilGridDesign(6, 7, 80.0, 0.3)),
-        (ASYMMETRIC, AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark")),
-        (
-            ASYMMETRIC.replace("radius_mm = 6.0", "diameter_mm = 12.0"),
-            AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark"),
-        ),
+        (ASYMMETRIC, CIRCLES),
+        (ASYMMETRIC.replace("radius_mm = 6.0", "diameter_mm = 12.0"), CIRCLES),
         (HEXAGONAL, HexagonalCirclesDesign(9, 4, 20.0, 6.0, "dark")),
-        (
-            HEXAGONAL + "rings = [[1, 2], [0, 3]]\n",
-            HexagonalCirclesDesign(9, 4, 20.0, 6.0, "dark", rings=((0, 3), (1, 2))),
-        ),
+        (HEXAGONAL + "rings = [[1, 2], [0, 3]]\n", HexagonalCirclesDesign(9, 4, 20.0, 6.0, "dark", rings=RINGS)),
         (DOTS + "rings = [[0, 3]]\n", BoardDesign(5, 7, 20.0, 5.0, "dark", DOTS_SIGMA_MM, rings=((0, 3),))),
         *((board_toml(board), board) for board in (reference_board(), *WITH_CORNER)),
         (KALIBR["aprilgrid"], AprilGridDesign(5, 6, 80.0, 0.3)),
@@ -67,15 +57,21 @@ def written(folder, text, name="board.toml"):
     ],
 )
 def test_files_of_every_kind_and_back(tmp_path, text, board):
-    path = written(tmp_path, text)
+    path = written(tmp_path / "board.toml", text)
     assert load_flat_board(path) == load_boards(path) == board
     if getattr(board, "radius_mm", 0.0) is not None:
-        assert load_flat_board(written(tmp_path, board_toml(load_board(path)))) == board
+        assert load_flat_board(written(tmp_path / "board.toml", board_toml(load_board(path)))) == board
+
+
+def refused(load, path, said: str) -> None:
+    with pytest.raises(InputError, match="board file") as caught:
+        load(path)
+    assert said in str(caught.value)
 
 
 def test_opencvs_asymmetric_grid():
     """Its documented layout: x = (2 j + i mod 2) · spacing, y = i · spacing."""
-    xy = AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark").xy_mm()
+    xy = CIRCLES.xy_mm()
     assert np.allclose(xy[[0, 1, 4, 5, 8, 43]], [[0, 0], [40, 0], [20, 20], [60, 20], [0, 40], [120, 200]])
 
 
@@ -92,10 +88,7 @@ def test_opencvs_asymmetric_grid():
         (APRILGRID + "border_bits = 3\n", "border_bits"),
         (ASYMMETRIC.replace("radius_mm = 6.0", ""), "radius_mm or diameter_mm needed, one of them"),
         (ASYMMETRIC.replace("6.0", "15.0"), "radius 15 mm, under 14.1421 mm needed for circles apart"),
-        (
-            HEXAGONAL.replace("6.0", "10.5"),
-            "radius 10.5 mm, under 10 mm needed for circles apart; spacing_mm is what",
-        ),
+        (HEXAGONAL.replace("6.0", "10.5"), "radius 10.5 mm, under 10 mm needed for circles apart; spacing_mm is what"),
         (DOTS + "rings = [[5, 0]]\n", "rings has [5, 0] of 5 rows of 7 dots"),
         (DOTS + "rings = [[0, 0], [4, 6]]\n", "2 rings that look the same after a turn"),
         (KALIBR["aprilgrid"].replace("0.08", "800"), "tagSize"),
@@ -115,21 +108,19 @@ def test_opencvs_asymmetric_grid():
     ],
 )
 def test_mistakes_in_files_are_named(tmp_path, text, said):
-    with pytest.raises(InputError, match="board file") as caught:
-        load_flat_board(written(tmp_path, text))
-    assert said in str(caught.value)
+    refused(load_flat_board, written(tmp_path / "board.toml", text), said)
 
 
 def test_several_boards_in_one_frame(tmp_path):
     """One written out, one in a file of its own, placed by angles, by a quaternion or by a matrix."""
-    written(tmp_path, KALIBR["aprilgrid"], "april.yaml")
+    written(tmp_path / "april.yaml", KALIBR["aprilgrid"])
     first = 'type = "boards"\n' + IN_A_SET
     matrix = "common_from_board = [[0.0,0.0,1.0,200.0],[0.0,1.0,0.0,0.0],[-1.0,0.0,0.0,50.0],[0.0,0.0,0.0,1.0]]\n"
     root = "0.7071067811865476"
     quaternion = BESIDE.replace("rpy_deg = [0.0, 90.0, 0.0]", f"qw = {root}\nqx = 0.0\nqy = {root}\nqz = 0.0")
     places = []
     for place in (BESIDE, matrix, quaternion):
-        found = load_boards(written(tmp_path, f'{first}[[board]]\nfile = "april.yaml"\n{place}'))
+        found = load_boards(written(tmp_path / "board.toml", f'{first}[[board]]\nfile = "april.yaml"\n{place}'))
         assert isinstance(found, BoardSet)
         assert found.names == ("board 1", "board 2 (april.yaml)")
         assert found.first_ids() == [0, 35]
@@ -156,7 +147,5 @@ def test_several_boards_in_one_frame(tmp_path):
     ],
 )
 def test_mistakes_in_sets_are_named(tmp_path, second, said):
-    path = written(tmp_path, f'type = "boards"\n{IN_A_SET}[[board]]\n{second}')
-    with pytest.raises(InputError, match="board file") as caught:
-        load_boards(path)
-    assert said in str(caught.value)
+    path = written(tmp_path / "board.toml", f'type = "boards"\n{IN_A_SET}[[board]]\n{second}')
+    refused(load_boards, path, said)

@@ -11,6 +11,7 @@ from stcal.boards.board_file import board_toml, load_dots
 from stcal.boards.target_file import load_target, target_toml
 from stcal.design import MIN_SINE, BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from tests.outcome import fails_with, refuses
+from tests.shared import written
 
 ROUNDED_MM = 1e-9
 """Lengths are written with nine decimals: half a unit of the last is 5e-10 mm."""
@@ -37,15 +38,11 @@ def rough(x: str, normal: str) -> str:
 
 
 def target_of(tmp_path, content: str | bytes) -> TargetDesign:
-    path = tmp_path / "target.toml"
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return load_target(path)
+    return load_target(written(tmp_path / "target.toml", content))
 
 
 def board_of(tmp_path, content: str | bytes) -> BoardDesign:
-    path = tmp_path / "board.toml"
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return load_dots(path)
+    return load_dots(written(tmp_path / "board.toml", content))
 
 
 def changed(old: str, new: str, text: str = TARGET) -> str:
@@ -66,7 +63,7 @@ def test_reference_target_round_trip(tmp_path):
         np.testing.assert_allclose(*poses, atol=2 * ROUNDED_MM)
 
 
-def test_the_reference_has_the_published_layout():
+def test_the_reference_has_the_published_layout_and_boards_have_arrays():
     # Zhang & Wei 2017, fig. 1: five faces, each of seven big (r = 8 mm) and three small (r = 4 mm) circles.
     target = reference_target()
     assert len(target.faces) == 5
@@ -76,19 +73,16 @@ def test_the_reference_has_the_published_layout():
     assert target.radius_of()["3:c"] == 4
     assert target.face("2").id == "2"
     refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", target.face, "9")
+    board = BoardDesign(2, 3, 10.0, 2.0, "dark", 0.005, (1, 2), 3.0)
+    np.testing.assert_array_equal(board.xy_mm(), [[0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [20, 10]])
+    assert board.labels() == ["board:0:0", "board:0:1", "board:0:2", "board:1:0", "board:1:1", "board:1:2"]
+    assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
 
 
 def test_the_commented_corner_is_right_once_uncommented(tmp_path):
     text = re.sub(r"^# (\[corner\]|row|column|radius_mm)", r"\1", board_toml(reference_board()), flags=re.MULTILINE)
     found = board_of(tmp_path, text)
     assert (found.corner, found.corner_radius_mm) == ((0, 0), 11.25)
-
-
-def test_board_arrays():
-    board = BoardDesign(2, 3, 10.0, 2.0, "dark", 0.005, (1, 2), 3.0)
-    np.testing.assert_array_equal(board.xy_mm(), [[0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [20, 10]])
-    assert board.labels() == ["board:0:0", "board:0:1", "board:0:2", "board:1:0", "board:1:1", "board:1:2"]
-    assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
 
 
 @pytest.mark.slow
@@ -99,9 +93,8 @@ def test_any_right_handed_drawing_frame_gives_the_same_face(tmp_path_factory, an
     drawn = [
         FaceDesign(f.id, f.ids, f.xy_mm @ turn.T + [x, y], f.radius_mm, f.origin, f.x, f.y) for f in reference.faces
     ]
-    path = tmp_path_factory.getbasetemp() / "drawn.toml"
-    path.write_text(target_toml(TargetDesign(reference.name, reference.polarity, tuple(drawn))))
-    found = load_target(path)
+    text = target_toml(TargetDesign(reference.name, reference.polarity, tuple(drawn)))
+    found = load_target(written(tmp_path_factory.getbasetemp() / "drawn.toml", text))
     for face, expected in zip(found.faces, reference.faces, strict=True):
         # Nine decimals over a frame of 80 mm, at circles up to 130 mm from its origin: a few roundings.
         np.testing.assert_allclose(face.xy_mm, expected.xy_mm, atol=5 * ROUNDED_MM)
@@ -117,9 +110,7 @@ identifiers = st.text(
 def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     xy = [[0, 0], [40, 0], [0, 40], [40, 40]]
     target = TargetDesign(name, "dark", (FaceDesign("f", tuple(ids), xy, [5.0, 5, 5, 8], *ids[:3]),))
-    path = tmp_path_factory.getbasetemp() / "names.toml"
-    path.write_text(target_toml(target), encoding="utf-8", newline="\n")
-    found = load_target(path)
+    found = load_target(written(tmp_path_factory.getbasetemp() / "names.toml", target_toml(target)))
     assert found.name == " ".join(name.split())  # a name is one line
     assert found.faces[0].ids == tuple(ids)
 
@@ -161,13 +152,10 @@ def test_a_target_without_rough_poses_has_the_key_in_a_comment(tmp_path):
     assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
 
 
-def test_small_likenesses_are_taken(tmp_path):
+def test_small_likenesses_are_taken_and_no_negative_zero_is_written(tmp_path):
     moved = changed("x_mm = 40, y_mm = 40, radius_mm = 4", "x_mm = 44, y_mm = 40, radius_mm = 4", FACE)
     two = target_of(tmp_path, TARGET + moved.replace('[[face]]\nid = "1"', '[[face]]\nid = "2"'))
     assert [face.id for face in two.faces] == ["1", "2"]  # 4 mm are more than half a radius
-
-
-def test_no_negative_zero_is_written():
     face = FaceDesign(
         "f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0, 5, 5, 8], "1", "2", "3"
     )
@@ -228,31 +216,25 @@ WRONG_BOARDS = {
 # fmt: on
 
 
-def assert_refused(load, content, message):
+WRONG = {f"target: {case}": (target_of, *each) for case, each in WRONG_TARGETS.items()}
+WRONG |= {f"board: {case}": (board_of, *each) for case, each in WRONG_BOARDS.items()}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_file_is_named_in_one_line(tmp_path, case):
+    load, content, message = WRONG[case]
     with fails_with(message) as caught:
-        load(content)
+        load(tmp_path, content)
     text = str(caught.value)
     assert re.match(r"(target|board) file \S+\.toml: ", text)
     assert len(text.splitlines()) == 1
     assert len(text) < 400  # a line to read, not a dump of the file
 
 
-@pytest.mark.parametrize("case", WRONG_TARGETS)
-def test_a_wrong_target_is_named_in_one_line(tmp_path, case):
-    assert_refused(lambda content: target_of(tmp_path, content), *WRONG_TARGETS[case])
-
-
-@pytest.mark.parametrize("case", WRONG_BOARDS)
-def test_a_wrong_board_is_named_in_one_line(tmp_path, case):
-    assert_refused(lambda content: board_of(tmp_path, content), *WRONG_BOARDS[case])
-
-
 @pytest.mark.parametrize("load", [load_target, load_dots])
-@pytest.mark.parametrize(
-    ("name", "message"), [(".", "E-FILE-UNREADABLE … Is a directory"), ("missing.toml", "E-FILE-UNREADABLE")]
-)
-def test_a_path_that_cannot_be_read(tmp_path, load, name, message):
-    refuses(message, load, tmp_path / name)
+def test_a_path_that_cannot_be_read(tmp_path, load):
+    refuses("E-FILE-UNREADABLE … Is a directory", load, tmp_path)
+    refuses("E-FILE-UNREADABLE", load, tmp_path / "missing.toml")
 
 
 @pytest.mark.parametrize("radius_mm", [8.625, 22.49])

@@ -177,7 +177,11 @@ def test_squares_and_tags_are_read_back(board):
         assert np.linalg.norm(views[BOARD].xy_px - xy[views[BOARD].ids], axis=1).max() < CORNER_PX
 
 
-def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
+def test_plates_have_their_margin_and_circles_and_holes_lie_where_the_design_has_them():
+    for part, face in zip(parts_of(reference_target(), 7.0), reference_target().faces, strict=True):
+        rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]
+        np.testing.assert_allclose(part.outline.min(0), rims.min((0, 1)) - 7.0)
+        np.testing.assert_allclose(part.outline.max(0), rims.max((0, 1)) + 7.0)
     board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark", rings=((0, 1), (3, 2)))
     (part,) = parts_of(board, 10.0)
     discs = [(s.x, -s.y, s.radius, s.ink) for s in part.shapes if s.layer == "PATTERN" and isinstance(s, Disc)]
@@ -185,13 +189,6 @@ def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
     wanted = [*((x, y, 3.0, "black") for x, y in board.xy_mm()), *holes]
     assert [ink for *_, ink in discs] == [ink for *_, ink in wanted]
     np.testing.assert_allclose([numbers for *numbers, _ in discs], [numbers for *numbers, _ in wanted])
-
-
-def test_plates_have_their_margin():
-    for part, face in zip(parts_of(reference_target(), 7.0), reference_target().faces, strict=True):
-        rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]
-        np.testing.assert_allclose(part.outline.min(0), rims.min((0, 1)) - 7.0)
-        np.testing.assert_allclose(part.outline.max(0), rims.max((0, 1)) + 7.0)
 
 
 SVG = "{http://www.w3.org/2000/svg}"

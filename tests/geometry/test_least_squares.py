@@ -26,14 +26,11 @@ def rosenbrock(x: np.ndarray) -> NormalEquations:
     return NormalEquations.of(residual, np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]))
 
 
-def test_a_curved_valley_is_followed_to_its_end():
+def test_a_curved_valley_is_followed_to_its_end_and_what_nothing_determines_stays():
     found = minimise(np.array([-1.2, 1.0]), rosenbrock, np.add)
     assert found.converged
     assert found.state == pytest.approx([1, 1], abs=1e-6)
     assert 5 < found.steps < 100
-
-
-def test_what_nothing_determines_stays():
     found = minimise(np.array([5.0, 7.0]), lambda x: NormalEquations.of(x[:1] - 2, np.array([[1.0, 0.0]])), np.add)
     assert found.state == pytest.approx([2, 7], abs=1e-6)
 
@@ -53,7 +50,7 @@ def test_many_problems_end_where_each_would_alone():
     assert found.state == pytest.approx(np.ones((3, 2)), abs=1e-6)
 
 
-def test_where_there_is_no_minimum_it_says_so():
+def test_where_there_is_no_minimum_it_says_so_and_an_impossible_state_is_never_taken():
     """The cost falls for ever: e⁻ˣ."""
     found = minimise(
         np.zeros(1), lambda x: NormalEquations.of(1e3 * np.exp(-x), -1e3 * np.exp(-x)[:, None]), np.add, max_steps=5
@@ -62,8 +59,6 @@ def test_where_there_is_no_minimum_it_says_so():
     refuses("E-NO-MINIMUM … fit … 5 … look", found.required, "fit", "look")
     assert found.required("fit", "look", accepted=1e9) is found
 
-
-def test_an_impossible_state_is_never_taken():
     def linearise(x):
         return NormalEquations.impossible(1) if x[0] <= 0.5 else NormalEquations.of(x - 0.1, np.ones((1, 1)))
 
@@ -173,14 +168,11 @@ def test_sigma_by_clusters_hold_with_and_without_common_errors(common, formal):
         assert 1 <= np.mean(larger) < 1.12
 
 
-def test_the_covariance_is_never_below_that_of_independent_errors():
+def test_the_covariance_is_never_below_that_of_independent_errors_and_enormous_where_nothing_is_determined():
     rng = np.random.default_rng(2)
     for _ in range(50):
         _, found, independent = drawn(rng, 5, 0.0)
         assert np.linalg.eigvalsh(found.covariance - independent).min() > -1e-12 * np.trace(independent)
-
-
-def test_what_nothing_determines_has_an_enormous_sigma():
     information = np.zeros((5, 3, 3))
     information[:, :2, :2] = np.eye(2)
     pull = np.random.default_rng(4).standard_normal((5, 3)) * [1, 1, 0]

@@ -246,11 +246,8 @@ def tilted_plane(seed: int):
 def test_one_of_the_poses_is_the_true_one_and_both_are_opencvs(seed):
     xy, seen, pose, cosine = tilted_plane(seed)
     found = poses_of_plane(xy, seen)
-    off = [
-        max(np.abs(p.rotation - pose.rotation).max(), np.abs(p.translation - pose.translation).max())
-        for p in found.poses
-    ]
-    assert min(off) < 1e-8  # rounding, over the condition of the homography
+    off = min(np.abs(each.matrix() - pose.matrix()).max() for each in found.poses)
+    assert off < 1e-8  # rounding, over the condition of the homography
     assert found.foreshortening == pytest.approx(cosine, abs=1e-9)
     _, turns, _, _ = cv2.solvePnPGeneric(np.pad(xy, ((0, 0), (0, 1))), seen, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     theirs = [cv2.Rodrigues(turn)[0] for turn in turns]
@@ -258,15 +255,11 @@ def test_one_of_the_poses_is_the_true_one_and_both_are_opencvs(seed):
         assert min(np.abs(ours.rotation - each).max() for each in theirs) < 1e-9
 
 
-def test_size_and_distance_change_det_j_but_not_the_foreshortening():
+def test_size_and_distance_change_det_j_but_not_the_foreshortening_and_from_behind_is_refused():
     xy, seen, _, _ = tilted_plane(3)
     one, ten = poses_of_plane(xy, seen), poses_of_plane(10 * xy, seen)
     assert ten.foreshortening == pytest.approx(one.foreshortening, rel=1e-9)
     assert ten.determinant == pytest.approx(one.determinant / 100, rel=1e-9)
-
-
-def test_from_behind_is_refused():
-    xy, seen, _, _ = tilted_plane(0)
     refuses("E-POINTS-MIRRORED", poses_of_plane, xy * [-1, 1], seen)
 
 
@@ -320,11 +313,8 @@ def test_hopeless_rivals_are_left():
     assert left.tolist() == [0, 0]
 
 
-def test_a_pose_with_points_behind_the_camera_is_no_minimum():
+def test_a_pose_with_points_behind_the_camera_is_no_minimum_and_blocks_stand_on_the_diagonal():
     assert evaluate(Poses.of([Rigid.exp([0, 0, 0, 0, 0, -400])])).cost[0] == np.inf
-
-
-def test_block_diagonal():
     blocks = RNG.normal(size=(2, 4, 2, 3))
     assert np.array_equal(block_diagonal(blocks[0]), block_diag(*blocks[0]))
     assert np.array_equal(block_diagonal(blocks)[1], block_diag(*blocks[1]))
@@ -371,10 +361,16 @@ def test_both_minima_are_found_from_either(side):
     assert np.linalg.norm(second[:3]) < 0.1
 
 
-def test_a_near_plane_has_one():
+def test_a_near_plane_has_one_and_a_descent_that_does_not_settle_raises():
     """25° at 100 mm, where perspective decides: one minimum, or a second one that is far worse."""
     cost = minima(tilted(0.44, 100.0), tilted(0.44, 100.0))[0].cost
     assert len(cost) == 1 or cost[1] > cost[0] + 1e4
+
+    def unsettled(poses, huber):
+        found = descend_to(measured(tilted(0.1, 500.0)), poses, huber)
+        return replace(found, settled=np.zeros(len(poses), bool))
+
+    refuses("E-NO-MINIMUM", two_minima, lambda _: unsettled, Poses.of([tilted(0.1, 500.0)]), MIDDLE, "no pose at all")
 
 
 def test_minima_are_told_apart_by_the_residuals_own_sigma():
@@ -387,24 +383,13 @@ def test_minima_are_told_apart_by_the_residuals_own_sigma():
     assert 5 * OUTLIER < limit < 20 * OUTLIER
 
 
-def test_mirrored_twice_is_where_it_was():
+def test_mirrored_twice_is_where_it_was_and_odds_decide():
+    """Even odds put half a squared distance on the covariance; one in 10⁶ needs Δχ² 27.6, of residuals as stated."""
     poses = Poses.of([tilted(0.3, 700.0), tilted(-0.2, 300.0)])
     plane = Rigid.exp([0.1, 0.2, 0.3, 5.0, 6.0, 7.0])
     twice = mirrored(mirrored(poses, plane), plane)
     assert twice.rotation == pytest.approx(poses.rotation, abs=1e-12)
     assert twice.translation == pytest.approx(poses.translation, abs=1e-9)
-
-
-def test_a_descent_that_does_not_settle_raises():
-    def unsettled(poses, huber):
-        found = descend_to(measured(tilted(0.1, 500.0)), poses, huber)
-        return replace(found, settled=np.zeros(len(poses), bool))
-
-    refuses("E-NO-MINIMUM", two_minima, lambda _: unsettled, Poses.of([tilted(0.1, 500.0)]), MIDDLE, "no pose at all")
-
-
-def test_odds():
-    """Even odds put half a squared distance on the covariance; one in 10⁶ needs Δχ² 27.6, of residuals as stated."""
     away = np.array([0.1, 0, 0, 2.0, 0, 0])
     assert covariance_of_both(np.eye(6), away, 0.0) == pytest.approx(np.eye(6) + np.outer(away, away) / 2)
     assert covariance_of_both(np.eye(6), away, np.inf) == pytest.approx(np.eye(6))

@@ -13,14 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.camera_model import CameraPrior
 from stcal.locate.estimate import SeenTags, locate, merge
 from stcal.locate.scenes import exposure_times
-from stcal.locate.verdict import (
-    PatentOptions,
-    VerdictOptions,
-    gate,
-    judge,
-    largest_area,
-    locate_as_patent,
-)
+from stcal.locate.verdict import PatentOptions, VerdictOptions, gate, judge, largest_area, locate_as_patent
 from tests.outcome import refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
@@ -63,9 +56,8 @@ def test_intrinsics_with_sigma_make_the_pose_as_uncertain():
     squares, held = [], []
     for _ in range(100):
         truth = random_pose(rng)
-        real = plain.with_parameters(
-            np.concatenate([plain.parameters()[:4] + sigma * rng.standard_normal(4), np.zeros(8)])
-        )
+        off = np.append(sigma * rng.standard_normal(4), np.zeros(8))
+        real = plain.with_parameters(plain.parameters()[:12] + off)
         seen = merge(simulated_exposures(LAYOUT, truth, rng, camera=real), LAYOUT).seen
         for prior, into in ((CameraPrior("PINHOLE", np.diag(sigma**2)), squares), (None, held)):
             pose = locate(seen, LAYOUT, plain, prior)
@@ -121,19 +113,13 @@ def with_wrong_tag(rows: list[int], row: int) -> SeenTags:
     return merge([Tags(tags.tags, corners, tags.joint_px2)], LAYOUT).seen
 
 
-def test_a_wrong_tag_is_left_out():
+def test_a_wrong_tag_is_left_out_two_that_contradict_are_rejected_and_none_is_refused():
     pose = locate(with_wrong_tag(list(SIX), 2), LAYOUT, CAMERA)
     assert pose.outliers == (2,)
     assert np.linalg.norm(error_of(pose, Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0]))[:3]) < np.radians(0.3)
-
-
-def test_two_tags_that_contradict_are_rejected():
     _, verdict = judge(locate(with_wrong_tag([0, 3], 3), LAYOUT, CAMERA))
     assert verdict.decision == "reject"
     assert verdict.reasons[0].startswith("chi2 per dof")
-
-
-def test_no_tag_is_refused():
     empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0))
     refuses("E-LOCATE-NO-TAG", locate, empty, LAYOUT, CAMERA)
 
@@ -159,13 +145,10 @@ def tag_at(x: float, y: float, side: float = 10.0) -> np.ndarray:
     return np.array([[x, y], [x + side, y], [x + side, y + side], [x, y + side]])
 
 
-def test_exposure_times_are_a_geometric_series():
+def test_exposure_times_are_a_geometric_series_and_exposures_are_chosen_by_number_and_area():
     assert np.allclose(exposure_times(1.0, 16.0, 5), [1, 2, 4, 8, 16])
     refuses("E-EXPOSURES-VALUE", exposure_times, 0.0, 1.0, 3)
     refuses("E-EXPOSURES-VALUE", exposure_times, 1.0, 2.0, 1)
-
-
-def test_selection_by_number_and_area():
     small = np.stack([tag_at(0, 0), tag_at(20, 0)])
     large = np.stack([tag_at(0, 0), tag_at(90, 0)])
     single = tag_at(0, 0)[None]

@@ -13,6 +13,7 @@ from stcal.locate.layout import LayoutPlan, layout_toml, load_layout, load_plan
 from stcal.locate.layout_calibration import CalibratedLayout, ImageCorners, _turned_alike, calibrate
 from tests.levels import sampled
 from tests.outcome import refuses
+from tests.shared import written
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
 
 HEAD = 'type = "tags"\n'
@@ -21,19 +22,18 @@ NEGATIVE = f"covariance_mm2 = {[[0.0] * k + [-1.0 if k else 1.0] for k in range(
 PLACED = TAG + "size_mm = 20.0\nx_mm = {}\ny_mm = {}\nangle_deg = {}\n"
 
 
-def written(tmp_path, text):
-    path = tmp_path / "layout.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def test_obj_lies_in_the_middle_of_the_origin_tag(tmp_path):
+def test_obj_lies_in_the_middle_of_the_origin_tag_and_a_plan_may_leave_places_open(tmp_path):
     text = HEAD + "origin = 2\n" + PLACED.format(1, 0, 0, 0) + PLACED.format(2, 100, 50, 90)
-    layout = load_layout(written(tmp_path, text))
+    layout = load_layout(written(tmp_path / "layout.toml", text))
     assert layout.origin == 1
     assert np.allclose(layout.corners_mm[1], 20.0 * UNIT_SQUARE, atol=1e-12)
     # tag 1 as seen from tag 2, which is turned by a quarter from X to Y
     assert np.allclose(layout.corners_mm[0].mean(0), [-50, 100], atol=1e-12)
+    path = written(tmp_path / "layout.toml", HEAD + TAG.format(4) + "size_mm = 20.0\n" + PLACED.format(5, 1, 2, 0))
+    plan = load_plan(path)
+    assert np.isnan(plan.corners_mm[0]).all()
+    assert np.isfinite(plan.corners_mm[1]).all()
+    refuses("E-TAG-PLACE … 4", load_layout, path)
 
 
 def test_a_calibrated_layout_comes_back(tmp_path):
@@ -41,21 +41,13 @@ def test_a_calibrated_layout_comes_back(tmp_path):
     rng = np.random.default_rng(0)
     mix = rng.standard_normal((48, 48))
     layout = type(layout)(layout.name, layout.tags, layout.corners_mm, 1e-4 * mix @ mix.T, 0, 0.3)
-    path = written(tmp_path, layout_toml(layout, ["a comment"]))
+    path = written(tmp_path / "layout.toml", layout_toml(layout, ["a comment"]))
     again = load_layout(path)
     assert np.abs(again.corners_mm - layout.corners_mm).max() < 1e-6  # six decimals
     # six digits of each element
     assert np.abs(again.covariance_mm2 - layout.covariance_mm2).max() < 1e-5 * np.abs(layout.covariance_mm2).max()
     assert (again.tags, again.origin, again.sigma_px) == (layout.tags, 0, 0.3)
     assert load_flat_board(path).tags == layout.tags  # and it is a board of tags
-
-
-def test_a_plan_may_leave_places_open(tmp_path):
-    path = written(tmp_path, HEAD + TAG.format(4) + "size_mm = 20.0\n" + PLACED.format(5, 1, 2, 0))
-    plan = load_plan(path)
-    assert np.isnan(plan.corners_mm[0]).all()
-    assert np.isfinite(plan.corners_mm[1]).all()
-    refuses("E-TAG-PLACE … 4", load_layout, path)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +62,7 @@ def test_a_plan_may_leave_places_open(tmp_path):
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, reason):
-    refuses(reason, load_layout, written(tmp_path, HEAD + text))
+    refuses(reason, load_layout, written(tmp_path / "layout.toml", HEAD + text))
 
 
 BOARD = ChessboardDesign(6, 9, 20.0)
@@ -180,26 +172,14 @@ def test_obj_lies_where_it_is_on_the_board_and_a_misread_tag_moves_little():
     assert np.abs(bad.layout.corners_mm - good.layout.corners_mm)[2].max() < 2 * sigma
 
 
-def test_what_cannot_be_calibrated_is_named():
+def test_what_cannot_be_calibrated_is_named_and_images_are_numbered_in_an_order_that_links_them():
+    """Of the last three the first two share no tag, and the third links them, with fewer tags than either."""
     boards, tags, names = views(3, 0)
     refuses("E-LAYOUT-FEW-IMAGES … 1 … 3 … 2", calibrate, PLAN, [boards[0], None, None], tags, names, CAMERA)
     without = [Tags(t.tags[1:], t.corners_px[1:], t.joint_px2[1:]) for t in tags]
     refuses("E-LAYOUT-UNLINKED … 0 … 3", calibrate, PLAN, boards, without, names, CAMERA)
     result = calibrate(PLAN, [*boards, None], [*tags, tags[0]], [*names, "bare.png"], CAMERA)
     assert result.left_out == ("bare.png: the board is not seen",)
-
-
-def test_deviation_from_nominal_places():
-    nominal = np.array(LAYOUT.corners_mm)
-    nominal[3] += [3.0, 0.0]  # a tag that was glued 3 mm off
-    plan = LayoutPlan("example", LAYOUT.tags, PLAN.size_mm, 0, nominal)
-    result = calibrate(plan, *views(8, 1), CAMERA)
-    assert int(np.argmax(result.deviation_mm)) == 3
-    assert 1.5 < result.deviation_mm[3] < 3.5  # the fit of all takes part of it
-
-
-def test_images_are_numbered_in_an_order_that_links_them():
-    """The first two share no tag, and the third links them, with fewer tags than either."""
 
     def image(name: str, rows: list[int]) -> ImageCorners:
         facing = Rigid(np.eye(3), np.array([0.0, 0.0, 100.0]))
@@ -212,3 +192,12 @@ def test_images_are_numbered_in_an_order_that_links_them():
     images = [image("a", [3, 4, 5, 6]), image("b", [0, 1, 2]), image("c", [2, 3])]
     assert _turned_alike(images, ()) == images
     refuses("E-LAYOUT-UNLINKED … b shares no tag", _turned_alike, images[:2], ())
+
+
+def test_deviation_from_nominal_places():
+    nominal = np.array(LAYOUT.corners_mm)
+    nominal[3] += [3.0, 0.0]  # a tag that was glued 3 mm off
+    plan = LayoutPlan("example", LAYOUT.tags, PLAN.size_mm, 0, nominal)
+    result = calibrate(plan, *views(8, 1), CAMERA)
+    assert int(np.argmax(result.deviation_mm)) == 3
+    assert 1.5 < result.deviation_mm[3] < 3.5  # the fit of all takes part of it

@@ -102,7 +102,7 @@ def test_png_holds_the_image_exactly(tmp_path):
     np.testing.assert_array_equal(picture, render(scene, "12", 0, RenderOptions(bit_depth=16)))
 
 
-def test_refusals(tmp_path, scene):
+def test_refusals_and_a_data_set_that_fails_leaves_no_folder(tmp_path, scene):
     (tmp_path / "mine.txt").write_text("keep")
     refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path, scene)
     refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path / "mine.txt", scene)
@@ -110,8 +110,6 @@ def test_refusals(tmp_path, scene):
     refuses("E-OPTION-FORM … tif", write_dataset, tmp_path / "new", scene, image_format="tif")
     refuses("E-OPTION-FORM", write_dataset, tmp_path / "new", scene, RenderOptions(bit_depth=16))
 
-
-def test_a_data_set_that_fails_leaves_no_folder(tmp_path, scene):
     def fails(done, total):
         raise RuntimeError("no")
 

@@ -1,4 +1,5 @@
-"""Thin lens and rims: rendered circles equal rays traced through lens and rim, and are biased as optics says."""
+"""Thin lens and rims: rendered circles equal rays traced through lens and rim, and are biased as optics says.
+Photographs exposed again."""
 
 import json
 from dataclasses import replace
@@ -10,7 +11,7 @@ import pytest
 from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.synthetic.dataset import TruthFile
-from stcal.synthetic.optics import ThinLens, blur_evenly
+from stcal.synthetic.optics import FULL_WELL, READ_NOISE, Light, ThinLens, blur_evenly, expose
 from stcal.synthetic.render import RenderOptions, _add_circles, check_lens, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.levels import FULL
@@ -201,3 +202,41 @@ def test_refusals(scene):
     refuses("E-SIMULATE-OPTIONS … 100 mm … at most 20", check_lens, scene, ThinLens(2.0, 24.0, 100.0))
     wide = make_scene(replace(OPTIONS, distance_mm=500, groups=(("1", "2"),), fisheye_deg=120.0))
     refuses("E-SIMULATE-OPTIONS … equidistant", check_lens, wide, ThinLens(4.0, 24.0, 500.0))
+
+
+RAMP = np.tile(np.linspace(20, 200, 300).astype(np.uint8), (200, 1))
+
+
+def test_brightness_follows_time_as_do_saturation_and_noise():
+    once, twice = expose(RAMP, [1.0, 0.5])
+    assert np.abs(once.astype(float).mean(0) - RAMP[0]).max() < 1.5
+    assert np.abs(twice.astype(float).mean(0) - RAMP[0] / 2).max() < 1.5
+    grey = np.full((300, 300), 128, np.uint8)
+    dark, normal, bright = expose(grey, [0.1, 1.0, 4.0])
+    assert (bright == 255).all()
+    # Shot noise, read noise, and the steps of grey in the photograph (1/√12 of a grey level) and in the exposure.
+    time, level = np.array([0.1, 1.0]), FULL_WELL / 256
+    variance = FULL_WELL / 2 * time + READ_NOISE**2 + (time * level) ** 2 / 12 + level**2 / 12
+    expected = np.sqrt(variance) / FULL_WELL * 255
+    assert normal.std() == pytest.approx(expected[1], rel=0.05)
+    assert dark.std() == pytest.approx(expected[0], rel=0.05)
+
+
+def test_light_falls_off_and_glares():
+    photograph = np.full((400, 200), 64, np.uint8)
+    (graded,) = expose(photograph, [1.0], Light(stops=2.0))
+    columns = graded.mean(0)  # noise of a grey level, of 400 rows
+    assert columns[100] == pytest.approx(64.5 * 255 / 256, rel=0.005)
+    assert columns[199] / columns[0] == pytest.approx(4, rel=0.02)
+    (spot,) = expose(photograph, [1.0], Light(glare=0.5, glare_at=(0.25, 1.0), glare_radius=0.1))
+    near = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 20.0**2)).mean() ** 2  # of the Gaussian's peak, over 11 × 11 px
+    assert spot[195:206, 45:56].mean() - columns[100] == pytest.approx(127.5 * near, rel=0.01)
+    assert spot[195:206, 145:156].mean() == pytest.approx(columns[100], rel=0.005)
+
+
+def test_the_same_seed_gives_the_same_images_and_what_cannot_be_exposed_is_refused():
+    first, again, other = (expose(RAMP, [1.0], seed=seed)[0] for seed in (3, 3, 4))
+    assert (first == again).all()
+    assert (first != other).any()
+    refuses("E-IMAGE-TYPE", expose, RAMP.astype(float), [1.0])
+    refuses("E-EXPOSURES-VALUE", expose, RAMP, [0.0])

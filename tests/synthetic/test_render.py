@@ -65,11 +65,14 @@ def test_centroids_and_areas_agree_with_the_exact_rim():
     assert 0.02 < np.abs(centres - exact[:, 1:]).max() < 0.3
 
 
-def test_determined_by_the_seeds(scene):
+def test_determined_by_the_seeds_and_options_that_are_checked(scene):
     options = RenderOptions(clutter=True)
     first = render(scene, "12", 1, options)
     np.testing.assert_array_equal(first, render(scene, "12", 1, options))
     assert 0.3 < (first != render(scene, "12", 1, replace(options, seed=1))).mean() < 1
+    refuses("E-SIMULATE-OPTIONS … 12", RenderOptions, bit_depth=12)
+    refuses("E-SIMULATE-OPTIONS … reflectance 1.2", RenderOptions, reflectance=1.2)
+    refuses("E-SIMULATE-OPTIONS … noise … -1", RenderOptions, noise=-1)
 
 
 def test_noise_has_the_spread_asked_for(second):
@@ -85,9 +88,8 @@ def test_circles_are_bright_or_dark_as_designed(scene, second):
         x, y = np.rint(seen.centre_px[seen.must_find]).astype(int).T
         big = seen.radius_mm[seen.must_find] > 4.5
         assert low < picture[y, x][big].min() <= picture[y, x][big].max() < high
-        rim = made.camera.project(
-            rim_points(seen.xyz_camera, seen.normal_camera, seen.radius_mm + 4000 / made.camera.focal[0], 12)
-        )
+        larger_mm = seen.radius_mm + 4000 / made.camera.focal[0]
+        rim = made.camera.project(rim_points(seen.xyz_camera, seen.normal_camera, larger_mm, 12))
         x, y = np.rint(rim[seen.must_find]).astype(int).reshape(-1, 2).T
         around = np.median(picture[y, x])
         assert around < 20 if made is scene else around > 160
@@ -136,12 +138,6 @@ def test_vignetting_gradient_blur_and_exposure(second):
     assert np.abs(np.diff(picture(blur_px=2.0), axis=1)).max() < 0.6 * np.abs(np.diff(base, axis=1)).max()
 
 
-def test_options_are_checked():
-    refuses("E-SIMULATE-OPTIONS … 12", RenderOptions, bit_depth=12)
-    refuses("E-SIMULATE-OPTIONS … reflectance 1.2", RenderOptions, reflectance=1.2)
-    refuses("E-SIMULATE-OPTIONS … noise … -1", RenderOptions, noise=-1)
-
-
 def test_rings_are_dots_with_a_hole_about_the_same_centre():
     """The hole has 0.4 of the radius and the plate's grey; the mean of the light is where the dot's centre is seen."""
     rings = ((1, 2), (2, 3))
@@ -154,9 +150,8 @@ def test_rings_are_dots_with_a_hole_about_the_same_centre():
     circles = image_circles(scene, group, 0)
     y, x = np.nonzero(np.abs(off) > 0)
     near = {}
-    for label, centre, radius, xyz in zip(
-        circles.labels, circles.centre_px, circles.radius_mm, circles.xyz_camera, strict=True
-    ):
+    seen = zip(circles.labels, circles.centre_px, circles.radius_mm, circles.xyz_camera, strict=True)
+    for label, centre, radius, xyz in seen:
         inside = np.hypot(x - centre[0], y - centre[1]) < 1.2 * scene.camera.focal[0] * radius / xyz[2]
         if inside.any():
             light = off[y[inside], x[inside]]
