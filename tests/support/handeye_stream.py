@@ -31,7 +31,7 @@ class StreamTruth:
     setup: Setup
 
 
-def trajectory(seconds: np.ndarray, phase: np.ndarray) -> Poses:
+def swing(seconds: np.ndarray, phase: np.ndarray) -> Poses:
     """camera_from_board (k,) of a board that swings about all axes; ``phase`` : (2, 3)."""
     turn = TURN_RAD * np.sin(np.outer(seconds, TURN_RATE) + phase[0])
     way = MIDDLE_MM + WAY_MM * np.sin(np.outer(seconds, WAY_RATE) + phase[1])
@@ -57,7 +57,7 @@ def simulated_stream(
     def moving(seconds: np.ndarray) -> Poses:
         if still:
             seconds = stamps[np.abs(seconds[:, None] - stamps).argmin(1)]
-        mount_from_stand = x @ trajectory(seconds, phase) @ z.inverse()
+        mount_from_stand = x @ swing(seconds, phase) @ z.inverse()
         return mount_from_stand.inverse() if setup == "eye-in-hand" else mount_from_stand
 
     stream = disturbed(rng, moving(every), *SAMPLE)
