@@ -48,7 +48,7 @@ from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import second_design, tag_body
 from tests.outcome import refuses
-from tests.support.circle_images import area_and_centroid
+from tests.support.areas import area_and_centroid
 
 PER_MM = 4
 """With fewer, the letters beside a plate pass for circles seen from the side."""

@@ -32,8 +32,8 @@ from tests.handeye.photographed import (
     take,
 )
 from tests.handeye.test_cli import CHANCE, EXACT, in_sigmas
-from tests.outcome import fails_with
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.outcome import fails_with, refuses
+from tests.support.areas import circle_conic, ellipse_of_conic
 from tests.support.handeye import FLANGE_FROM_CAMERA
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
@@ -144,8 +144,7 @@ def test_a_board_that_looks_the_same_after_half_a_turn_is_numbered_up_to_it(tmp_
 
 def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
-    with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
-        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
+    refuses("E-CAMERA-CENTRE … 406 … 293 … a.png", detect_boards, find_images(tmp_path)[0], MODEL, dots(), workers=1)
     (tmp_path / "a.png").write_bytes(b"")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)

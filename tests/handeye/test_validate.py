@@ -129,8 +129,7 @@ def test_the_last_motions_are_predicted_by_those_before():
     off = Rigid(np.eye(3), across) @ truth.mount_from_camera
     expected = 2 * np.sin(np.linalg.norm(motions.alpha[0]) / 2)
     assert motion_errors(off, motions)[0] == pytest.approx([0, expected], abs=1e-5)
-    with fails_with("E-OPTION-RANGE … --motions-held-out … 7 … 8 … 6"):
-        predict_motions(truth.pairs, count=7)
+    refuses("E-OPTION-RANGE … --motions-held-out … 7 … 8 … 6", predict_motions, truth.pairs, count=7)
 
 
 def scara(rng, count=12, setup="eye-to-hand", sigma=(5e-4, 0.1)):

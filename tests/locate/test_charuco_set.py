@@ -8,7 +8,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.locate.layout import LayoutPlan
 from stcal.workflows.board_views import calibration_images
 from tests.levels import sampled
-from tests.support.holdout import half_calibrated, subset_trials
+from tests.support.tags import half_calibrated, subset_trials
 
 pytestmark = pytest.mark.slow  # a set that lies beside the repository
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")

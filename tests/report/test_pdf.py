@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from stcal.report.document import Document, Html, Section, Table, fold, pdf_of
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 pytestmark = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="poppler-utils is not installed")
 OUTSIDE = (
@@ -45,5 +45,4 @@ def test_a_page_is_printed_on_a4_with_numbers_and_its_title_without_what_paper_c
 
 def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    with fails_with("E-EXTRA-MISSING"):
-        pdf_of(page(1))
+    refuses("E-EXTRA-MISSING", pdf_of, page(1))

@@ -9,7 +9,7 @@ from stcal.synthetic.designs import second_design
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points
 from tests.outcome import refuses
-from tests.support.circle_images import area_and_centroid
+from tests.support.areas import area_and_centroid
 
 OPTIONS = SceneOptions(seed=1, width=648, height=432, images_per_group=2, groups=(("1", "2"), ("1", "5")))
 PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0)

@@ -30,7 +30,7 @@ from stcal.synthetic.designs import second_design, tag_cube
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points
 from tests.outcome import fails_with, refuses
-from tests.support.circle_images import area_and_centroid, simulate_centres
+from tests.support.areas import area_and_centroid, simulate_centres
 
 OPTIONS = SceneOptions(seed=3, width=1296, height=864, images_per_group=4)
 

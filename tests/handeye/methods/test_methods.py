@@ -78,8 +78,7 @@ def test_poses_in_two_groups_half_a_turn_apart():
     pairs = HandEyePoses(flange, board)
     for method in ("shah", "pose"):
         assert off(handeye(pairs, method=method), truth)[0] < 1e-8
-    with fails_with("E-HANDEYE-LARGE-TURNS"):
-        handeye(pairs, method="park-martin")
+    refuses("E-HANDEYE-LARGE-TURNS", handeye, pairs, method="park-martin")
     assert poses_with_log(Loop.of(pairs, "eye-in-hand")).sum() == 2
 
 
