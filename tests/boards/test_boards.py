@@ -95,7 +95,7 @@ def test_a_steep_chessboard_is_found():
     assert errors_px(board, view, image_from_mm, first)[0] < 3 * CORNER_PX
 
 
-def test_tags_of_two_families_and_sizes():
+def test_tags_of_two_families_and_sizes_and_one_seen_twice_which_is_left_out():
     families = ("DICT_6X6_250", "DICT_APRILTAG_36h11")
     places = {(families[0], 3): (60, 50, 40), (families[1], 3): (150, 60, 30), (families[0], 9): (80, 130, 50)}
     sheet = np.full((200 * 4, 220 * 4), 255, np.uint8)
@@ -115,9 +115,6 @@ def test_tags_of_two_families_and_sizes():
     # squared errors over their covariance; the image has one noise, and corners of 3 tags are 24 numbers
     square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(view.covariance_px2), error).sum() / error.size
     assert 0.2 < square < 4.0
-
-
-def test_a_tag_that_is_seen_twice_is_left_out():
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     tag = cv2.copyMakeBorder(cv2.aruco.generateImageMarker(dictionary, 7, 160), 40, 40, 40, 40, 0, value=255)
     sheet = np.hstack([tag, tag])

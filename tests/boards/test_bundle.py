@@ -66,7 +66,7 @@ def test_a_photograph_of_a_bundle(tmp_path):
     assert abs(pose.translation[2] - 500) < 2
 
 
-def test_tags_that_stand_as_opencv_draws_them(tmp_path):
+def test_tags_that_stand_as_opencv_draws_them_and_standalone_ones_without_a_place(tmp_path):
     as_april = load_layout(written(tmp_path / "tags.yaml", BUNDLE)).corners_mm
     upright = load_layout(written(tmp_path / "tags.yaml", "upright: true\n" + BUNDLE)).corners_mm
     np.testing.assert_allclose(upright[0], [[-40, -40], [40, -40], [40, 40], [-40, 40]], atol=1e-9)
@@ -76,9 +76,6 @@ def test_tags_that_stand_as_opencv_draws_them(tmp_path):
         ("DICT_APRILTAG_36h11", 0),
         ("DICT_APRILTAG_36h11", 1),
     )
-
-
-def test_standalone_tags_have_no_place(tmp_path):
     plan = load_plan(written(tmp_path / "tags.yaml", "tag_family: tag25h9\nstandalone_tags: [{id: 3, size: 0.05}]\n"))
     assert (plan.tags, plan.size_mm.tolist()) == ((("DICT_APRILTAG_25h9", 3),), [50.0])
     assert np.isnan(plan.corners_mm).all()

@@ -231,10 +231,14 @@ def test_the_reference_has_the_published_layout_and_boards_have_arrays():
     assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
 
 
-def test_the_commented_corner_is_right_once_uncommented(tmp_path):
+def test_comments_are_right_once_uncommented(tmp_path):
     text = re.sub(r"^# (\[corner\]|row|column|radius_mm)", r"\1", board_toml(reference_board()), flags=re.MULTILINE)
     found = board_of(tmp_path, text)
     assert (found.corner, found.corner_radius_mm) == ((0, 0), 11.25)
+    text = target_toml(target_of(tmp_path, TARGET))
+    assert target_of(tmp_path, text).rough_poses() == {}
+    uncommented = text.replace("# rough_pose", "rough_pose")
+    assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
 
 
 @pytest.mark.slow
@@ -267,10 +271,17 @@ def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     assert found.faces[0].ids == tuple(ids)
 
 
-def test_whole_numbers_are_ids_and_lengths_too(tmp_path):
+def test_whole_numbers_are_ids_small_likenesses_are_taken_and_no_negative_zero_is_written(tmp_path):
     text = re.sub(r'"(\d)"', r"\1", TARGET)
     face = target_of(tmp_path, text).faces[0]
     assert (face.id, face.ids, face.x) == ("1", ("1", "2", "3", "4"), "2")
+    moved = changed("x_mm = 40, y_mm = 40, radius_mm = 4", "x_mm = 44, y_mm = 40, radius_mm = 4", FACE)
+    two = target_of(tmp_path, TARGET + moved.replace('[[face]]\nid = "1"', '[[face]]\nid = "2"'))
+    assert [face.id for face in two.faces] == ["1", "2"]  # 4 mm are more than half a radius
+    face = FaceDesign(
+        "f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0, 5, 5, 8], "1", "2", "3"
+    )
+    assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 
 def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
@@ -295,23 +306,6 @@ def test_a_rough_pose_is_of_the_drawing_wherever_its_origin_is(tmp_path):
     pose = face.rough_target_from_face
     assert pose @ np.zeros(3) == pytest.approx([7, 8 - 100, 9 - 50])
     assert pose @ np.array([40.0, 40, 0]) == pytest.approx([7, 8 - 140, 9 - 90])
-
-
-def test_a_target_without_rough_poses_has_the_key_in_a_comment(tmp_path):
-    text = target_toml(target_of(tmp_path, TARGET))
-    assert target_of(tmp_path, text).rough_poses() == {}
-    uncommented = text.replace("# rough_pose", "rough_pose")
-    assert target_of(tmp_path, uncommented).rough_poses()["1"].matrix() == pytest.approx(np.eye(4))
-
-
-def test_small_likenesses_are_taken_and_no_negative_zero_is_written(tmp_path):
-    moved = changed("x_mm = 40, y_mm = 40, radius_mm = 4", "x_mm = 44, y_mm = 40, radius_mm = 4", FACE)
-    two = target_of(tmp_path, TARGET + moved.replace('[[face]]\nid = "1"', '[[face]]\nid = "2"'))
-    assert [face.id for face in two.faces] == ["1", "2"]  # 4 mm are more than half a radius
-    face = FaceDesign(
-        "f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0, 5, 5, 8], "1", "2", "3"
-    )
-    assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 
 # fmt: off

@@ -213,15 +213,12 @@ def assert_is_the_target(circles: dict[str, tuple[np.ndarray, float]]):
         np.testing.assert_allclose([circles[label][1] for label in face.labels()], face.radius_mm, atol=DIGITS)
 
 
-def test_a_design_is_drawn_like_its_file(files):
+def test_svg_has_the_target_in_mm_of_a_design_as_of_its_file(files):
     of_file, of_design = files / "of-file.svg", files / "of-design.svg"
     draw(files / "target.toml", of_file)
     assert stcal.draw(stcal.load_target(files / "target.toml"), of_design).path == of_design
     assert of_design.read_bytes() == of_file.read_bytes()
     refuses("E-OPTION-RANGE … -1", stcal.draw, files / "target.toml", of_design, margin_mm=-1.0)
-
-
-def test_svg_has_the_target_in_mm(files):
     drawn = draw(files / "target.toml", files / "target.svg")
     root = ElementTree.parse(drawn.path).getroot()
     width, height = float(root.get("width", "").removesuffix("mm")), float(root.get("height", "").removesuffix("mm"))
@@ -371,7 +368,7 @@ def test_a_dodecahedron_is_one_net(width_mm, paper):
     assert net_text(body).endswith(f"one sheet of {paper}")
 
 
-def test_plates_meet_in_the_net_as_they_do_in_space(target):
+def test_plates_meet_in_the_net_as_they_do_in_space_and_all_faces_are_read_from_it(target):
     """Folded circles' distances across an edge: at a fold both plates have the same corners."""
     part = net_part(target)
     plates = places_of(target, part)
@@ -383,9 +380,6 @@ def test_plates_meet_in_the_net_as_they_do_in_space(target):
         assert not (flat & ~real).any() or flat.sum() == 1  # two plates may touch at a corner of a third
         together += (flat & real).sum() == 2
     assert together == 4
-
-
-def test_all_faces_are_read_from_the_net(target):
     sheet = one_sheet([net_part(target)], "net")
     image = pages_of(pdf([sheet]))[0]
     found = detect_image(image, camera_of(image), target, None, EllipseOptions())
@@ -393,7 +387,9 @@ def test_all_faces_are_read_from_the_net(target):
     assert all(len(each.circles) == 9 for each in found.faces)
 
 
-def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
+def test_plates_that_run_the_same_way_do_not_share_an_edge_and_what_lacks_an_outline_is_refused(
+    target, tmp_path
+):
     """Two pages of a book: one would cover the other."""
     outline = [[-50, -50], [150, -50], [150, 150], [-50, 150]]
     pages = []
@@ -403,9 +399,6 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         pose = Rigid(turn, turn @ [50.0, 0, 0])
         pages.append(replace(reference_target().faces[number], outline_mm=outline, rough_target_from_face=pose))
     refuses("E-DRAW-NET", net_part, TargetDesign("book", "dark", tuple(pages)))
-
-
-def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
     refuses("E-DRAW-NET … --net … 1 … outline_mm", draw, tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
     nowhere = tuple(replace(face, rough_target_from_face=None) for face in target.faces)

@@ -41,7 +41,7 @@ def test_projection_is_opencvs(distortion, xy, depth_mm):
     np.testing.assert_allclose(camera.normalised_from_pixel(expected), xy, atol=1e-11)  # 1e-12 through slopes of 0.1
 
 
-def test_inverse_is_opencvs_in_all_of_the_image():
+def test_inverse_is_opencvs_in_all_of_the_image_and_points_keep_their_shape():
     camera = camera_of([-0.12, 0.08, 1e-3, -5e-4, 0.01])
     grid = np.stack(np.meshgrid(np.linspace(0, WIDTH, 20), np.linspace(0, HEIGHT, 15)), -1).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-13)
@@ -49,6 +49,9 @@ def test_inverse_is_opencvs_in_all_of_the_image():
     np.testing.assert_allclose(camera.normalised_from_pixel(grid), opencv, atol=1e-12)
     ideal = (grid - camera.centre) / camera.focal
     assert 0.005 < np.abs(opencv - ideal).max() < 0.1  # and there is distortion to remove: 30 px and more
+    for shape in [(2,), (0, 2), (3, 2), (3, 4, 2)]:
+        assert BARREL.normalised_from_pixel(np.full(shape, 2000.0)).shape == shape
+        assert BARREL.pixel_from_normalised(np.zeros(shape)).shape == shape
 
 
 @given(lenses, normalised)
@@ -56,12 +59,6 @@ def test_distort_and_undistort_are_inverse_in_either_order(distortion, xy):
     camera = camera_of(distortion)
     np.testing.assert_allclose(camera.distort(camera.undistort(0.5 * xy)), 0.5 * xy, atol=1.1e-12)
     np.testing.assert_allclose(camera.undistort(camera.distort(xy)), xy, atol=1e-11)
-
-
-def test_points_keep_their_shape():
-    for shape in [(2,), (0, 2), (3, 2), (3, 4, 2)]:
-        assert BARREL.normalised_from_pixel(np.full(shape, 2000.0)).shape == shape
-        assert BARREL.pixel_from_normalised(np.zeros(shape)).shape == shape
 
 
 def test_barrel_inverts_up_to_its_fold_and_refuses_every_point_beyond():

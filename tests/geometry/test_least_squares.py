@@ -92,12 +92,19 @@ def test_robust_sigma_is_sigma_of_normal_errors(coordinates):
     assert 0.04 < beyond < 0.10
 
 
-def test_hubers_loss_and_its_weight_belong_together():
+def test_hubers_loss_and_its_weight_belong_together_and_rows_have_the_scale_that_each_has_alone():
     length = np.linspace(0.1, 9, 50)
     slope = (huber_cost(length + 1e-6, 3.0) - huber_cost(length - 1e-6, 3.0)) / 2e-6
     assert slope == pytest.approx(2 * huber_weights(length, 3.0) * length, rel=1e-6)
     assert (huber_weights(length, np.inf) == 1).all()
     assert huber_cost(length, np.inf) == pytest.approx(length**2)
+    rng = np.random.default_rng(1)
+    length, among = np.abs(rng.standard_normal((40, 31))), rng.random((40, 31)) < 0.6
+    among[3], among[4] = False, np.arange(31) == 7
+    found = robust_sigmas(length, among)
+    assert np.isnan(found[3])
+    for k in (i for i in range(40) if i != 3):
+        assert found[k] == pytest.approx(robust_sigma(length[k, among[k]]), rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8])
@@ -106,16 +113,6 @@ def test_the_middle_of_few_lengths(count):
     lengths = np.random.default_rng(count).permutation(np.arange(1.0, count + 1))
     assert robust_sigma(lengths) * 0.6744897501960817 == pytest.approx((count + 1) / 2, rel=1e-12)
     assert np.isnan(robust_sigma(np.append(lengths, np.nan)))
-
-
-def test_rows_have_the_scale_that_each_has_alone():
-    rng = np.random.default_rng(1)
-    length, among = np.abs(rng.standard_normal((40, 31))), rng.random((40, 31)) < 0.6
-    among[3], among[4] = False, np.arange(31) == 7
-    found = robust_sigmas(length, among)
-    assert np.isnan(found[3])
-    for k in (i for i in range(40) if i != 3):
-        assert found[k] == pytest.approx(robust_sigma(length[k, among[k]]), rel=1e-12)
 
 
 @pytest.mark.parametrize("redundancy", [2.0, 7.5, 300.0, 1e9])

@@ -66,7 +66,7 @@ def test_fit_plane_finds_the_plane(pose):
         np.testing.assert_allclose((xyz + 3 * normal) @ plane.normal - plane.offset, side * 3, atol=1e-9)
 
 
-def test_plane_rms_is_the_spread_about_it():
+def test_plane_rms_is_the_spread_about_it_and_the_offset_that_of_the_field_notes():
     rng = np.random.default_rng(0)
     xyz = on_plane(rng.uniform(-100, 100, (4000, 2)))
     xyz[:, 2] = rng.normal(5, 0.1, 4000)
@@ -75,6 +75,9 @@ def test_plane_rms_is_the_spread_about_it():
     assert plane.rms == pytest.approx(0.1, rel=0.05)
     assert plane.rms == pytest.approx(np.sqrt(((xyz @ plane.normal - plane.offset) ** 2).mean()), rel=1e-9)
     assert plane.offset == pytest.approx(5, abs=0.008)
+    # 1 m, f = 5580 px, r = 8 mm, 45°: 0.18 px (FIELD_NOTES.md).
+    xyz = circle_image_offset([0, 0, 1000.0], np.array([np.sqrt(0.5), 0, -np.sqrt(0.5)]), 8.0)
+    assert np.hypot(*(5580 * xyz[:2] / xyz[2])) == pytest.approx(0.18, abs=0.005)
 
 
 @given(poses, st.sampled_from([4, 5, 20]))
@@ -165,7 +168,7 @@ def test_refinement_recovers_the_pose_from_a_poor_start(pose, turn, move):
     np.testing.assert_allclose(found.translation, pose.translation, atol=1e-5)
 
 
-def test_refinement_agrees_with_opencv_on_noisy_points():
+def test_refinement_agrees_with_opencv_on_noisy_points_and_refuses_those_behind_the_camera(monkeypatch):
     rng = np.random.default_rng(1)
     pose = Rigid.exp([0.5, 0.3, -0.2, -40, -30, 900])
     seen = view(pose, GRID) + rng.normal(0, 1e-4, GRID.shape)
@@ -177,9 +180,6 @@ def test_refinement_agrees_with_opencv_on_noisy_points():
     # Both minimise the same sum of squares; OpenCV's LM stops some 1e-6 from the minimum.
     np.testing.assert_allclose(ours.log(), np.concatenate([rvec, tvec]).ravel(), rtol=1e-5, atol=1e-6)
     assert np.abs(ours.translation - pose.translation).max() > 1e-3  # the noise did move it
-
-
-def test_refinement_refuses_points_behind_the_camera_and_poses_that_do_not_settle(monkeypatch):
     refuses("E-POINTS-BEHIND", refine_planar_pose, Rigid(translation=[0, 0, -500]), GRID, GRID / 1000)
     monkeypatch.setattr("stcal.geometry.plane.MAX_STEPS", 1)
     refuses("E-NO-MINIMUM … planar pose … 1", refine_planar_pose, Rigid(translation=[0, 0, 600]), GRID, GRID / 500)
@@ -221,12 +221,6 @@ def test_offset_point_projects_to_the_centre_of_the_fitted_ellipse(circle):
     # Points on an exact conic: the fit is limited by rounding, magnified by the aspect of up to 4 : 1.
     np.testing.assert_allclose(xyz[:2] / xyz[2], fitted_centre(rim(*circle)), atol=1e-11)
     np.testing.assert_array_equal(circle_image_offset(centre, -normal, radius), xyz)
-
-
-def test_offset_of_the_field_notes():
-    # 1 m, f = 5580 px, r = 8 mm, 45°: 0.18 px (FIELD_NOTES.md).
-    xyz = circle_image_offset([0, 0, 1000.0], np.array([np.sqrt(0.5), 0, -np.sqrt(0.5)]), 8.0)
-    assert np.hypot(*(5580 * xyz[:2] / xyz[2])) == pytest.approx(0.18, abs=0.005)
 
 
 def tilted_plane(seed: int):
@@ -284,7 +278,7 @@ def evaluate(poses, huber=3.0):
     return Normal.of((MEASURED - xy) / 0.01, by_pose / 0.01, possible, huber)
 
 
-def test_every_start_reaches_its_minimum():
+def test_every_start_reaches_its_minimum_and_a_pose_with_points_behind_the_camera_is_none():
     """To σ: 12 points, 24 − 6 degrees of freedom, χ² below 45 but for one in 2000; starts off by up to 17°, 30 mm."""
     far = [Rigid.exp([*RNG.normal(0, 0.1, 3), *RNG.normal(0, 10, 3)]) @ TRUTH for _ in range(5)]
     found = descend(evaluate, Poses.of(far), 1e-8)
@@ -293,6 +287,10 @@ def test_every_start_reaches_its_minimum():
     assert np.ptp(found.poses.translation, axis=0) == pytest.approx(0, abs=1e-4)
     sigma = np.sqrt(np.diag(np.linalg.inv(found.normal[0])))[3:]
     assert (np.abs(found.poses.translation[0] - TRUTH.translation) < 4 * sigma).all()
+    assert evaluate(Poses.of([Rigid.exp([0, 0, 0, 0, 0, -400])])).cost[0] == np.inf
+    blocks = RNG.normal(size=(2, 4, 2, 3))
+    assert np.array_equal(block_diagonal(blocks[0]), block_diag(*blocks[0]))
+    assert np.array_equal(block_diagonal(blocks)[1], block_diag(*blocks[1]))
 
 
 def test_hopeless_rivals_are_left():
@@ -311,13 +309,6 @@ def test_hopeless_rivals_are_left():
     left = descend(evaluate, start, 1e-9, hopeless=500.0).poses.translation[:, 0]
     assert followed[1] > 8
     assert left.tolist() == [0, 0]
-
-
-def test_a_pose_with_points_behind_the_camera_is_no_minimum_and_blocks_stand_on_the_diagonal():
-    assert evaluate(Poses.of([Rigid.exp([0, 0, 0, 0, 0, -400])])).cost[0] == np.inf
-    blocks = RNG.normal(size=(2, 4, 2, 3))
-    assert np.array_equal(block_diagonal(blocks[0]), block_diag(*blocks[0]))
-    assert np.array_equal(block_diagonal(blocks)[1], block_diag(*blocks[1]))
 
 
 DOTS = np.array([[x, y, 0.0] for x in (-30, -10, 10, 30) for y in (-20, 0, 20)])

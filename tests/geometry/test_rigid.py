@@ -73,30 +73,12 @@ def test_matrix_round_trip(a_from_b):
         assert_same(Rigid.from_matrix(matrix), a_from_b)
 
 
-def test_quarter_turn_about_z_by_hand():
+def test_quarter_turn_about_z_by_hand_and_fields_are_read_only_copies():
     a_from_b = Rigid.exp([0, 0, np.pi / 2, 10, 20, 30])
     np.testing.assert_allclose(a_from_b @ [1.0, 0, 0], [10, 21, 30], atol=1e-14)
     np.testing.assert_allclose(a_from_b.inverse() @ [10, 21, 30], [1, 0, 0], atol=1e-14)
     assert (a_from_b @ np.zeros((4, 5, 3))).shape == (4, 5, 3)
     np.testing.assert_allclose(Similarity(2.0, a_from_b) @ [1.0, 0, 0], [10, 22, 30], atol=1e-14)
-
-
-@given(vectors, vectors)
-def test_skew_is_the_cross_product(v, w):
-    np.testing.assert_allclose(skew(np.array([[v, w]])) @ w, [[np.cross(v, w), np.zeros(3)]], atol=1e-9)  # up to 1e6
-    np.testing.assert_array_equal(skew(v), -skew(v).T)
-
-
-def test_products_of_accepted_rotations_are_accepted():
-    # Seven printed digits: each factor passes the 1e-6 check; unprojected, the third product would not.
-    rotation = np.eye(3) * (1 + 4e-7)
-    product = Rigid(rotation)
-    for _ in range(10):
-        product = product @ Rigid(rotation)
-    np.testing.assert_allclose(product.rotation @ product.rotation.T, np.eye(3), atol=1e-12)
-
-
-def test_fields_are_read_only_copies():
     rotation = np.eye(3)
     a_from_b = Rigid(rotation)
     rotation[0, 0] = 5
@@ -105,6 +87,26 @@ def test_fields_are_read_only_copies():
         a_from_b.translation[0] = 1
     with pytest.raises(AttributeError):
         a_from_b.translation = np.ones(3)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(v, w):
+    np.testing.assert_allclose(skew(np.array([[v, w]])) @ w, [[np.cross(v, w), np.zeros(3)]], atol=1e-9)  # up to 1e6
+    np.testing.assert_array_equal(skew(v), -skew(v).T)
+
+
+def test_products_of_accepted_rotations_are_accepted_and_the_rounding_of_a_text_file_repaired():
+    # Seven printed digits: each factor passes the 1e-6 check; unprojected, the third product would not.
+    rotation = np.eye(3) * (1 + 4e-7)
+    product = Rigid(rotation)
+    for _ in range(10):
+        product = product @ Rigid(rotation)
+    np.testing.assert_allclose(product.rotation @ product.rotation.T, np.eye(3), atol=1e-12)
+    exact = Rigid.exp([0.3, -0.2, 0.9, 1, 2, 3])
+    repaired = Rigid.from_matrix(np.round(exact.matrix(), 4))
+    error = np.abs(repaired.rotation - exact.rotation).max()
+    assert 0 < error < 1e-4  # four decimals were lost, and no more than that comes back
+    np.testing.assert_allclose(repaired.rotation @ repaired.rotation.T, np.eye(3), atol=1e-14)
 
 
 def _changed(row, column, value):
@@ -135,14 +137,6 @@ def _changed(row, column, value):
 )
 def test_what_is_no_transform_is_refused(make, given, message):
     refuses(message, make, *given)
-
-
-def test_from_matrix_repairs_the_rounding_of_a_text_file():
-    exact = Rigid.exp([0.3, -0.2, 0.9, 1, 2, 3])
-    repaired = Rigid.from_matrix(np.round(exact.matrix(), 4))
-    error = np.abs(repaired.rotation - exact.rotation).max()
-    assert 0 < error < 1e-4  # four decimals were lost, and no more than that comes back
-    np.testing.assert_allclose(repaired.rotation @ repaired.rotation.T, np.eye(3), atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.3, 2.0, np.pi - 1e-3])
@@ -228,7 +222,7 @@ def test_weights_of_zero_and_copies_count_as_absent_and_double(seed):
     np.testing.assert_allclose(align_rigid(xyz_a, xyz_b, [0, 1, 1, 1, 1]).matrix(), without.matrix(), atol=1e-8)
 
 
-def test_similarity_is_the_minimum_that_a_general_optimiser_finds():
+def test_similarity_is_the_minimum_that_a_general_optimiser_finds_and_no_reflection():
     rng = np.random.default_rng(5)
     xyz_b, weights = cloud(5, 7), rng.uniform(0.5, 2, 7)
     xyz_a = Similarity(1.7, random_rigid(5)) @ xyz_b + rng.normal(0, 5, (7, 3))
@@ -240,9 +234,6 @@ def test_similarity_is_the_minimum_that_a_general_optimiser_finds():
 
     best = minimize(cost, np.full(7, 0.01), method="BFGS", options={"gtol": 1e-6})
     assert cost(np.zeros(7)) == pytest.approx(best.fun, rel=1e-9)  # neither may be lower than the other
-
-
-def test_mirrored_points_give_a_rotation_not_a_reflection():
     xyz_b = cloud(2)
     mirrored = xyz_b * [1, 1, -1]
     found = align_rigid(mirrored, xyz_b)

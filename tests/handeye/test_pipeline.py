@@ -40,7 +40,7 @@ def test_the_answer_is_that_of_the_command(command, method, tmp_path):
 
 
 @pytest.mark.slow
-def test_results_without_some_poses_widen_sigma():
+def test_results_without_some_poses_widen_sigma_and_matrices_in_metres_are_pairs_of_poses():
     """Of eight poses they scatter by more than the adjustment's own σ; the size may be solved for too."""
     options = handeye.HandEyeOptions(with_scale=True)
     own = handeye.compare(PAIRS, methods=("pose",), options=options, rows=handeye.splits(8, None, 2))[0].result
@@ -48,10 +48,6 @@ def test_results_without_some_poses_widen_sigma():
     scaled = handeye.handeye(PAIRS, method="pose", options=options)
     assert scaled.covariance[3, 3] > 1.05 * own.covariance[3, 3]
     assert scaled.sigma_scale > 0
-
-
-@pytest.mark.slow
-def test_matrices_in_metres_are_pairs_of_poses():
     sides = sides_of(PAIRS)
     found = handeye.handeye(**{name: in_metres(poses) for name, poses in sides.items()}, unit="m", method="shah")
     same = handeye.handeye(pairs=PAIRS, setup="eye-in-hand", method="shah")
@@ -89,7 +85,7 @@ def written(command, tmp_path):
     return call
 
 
-def test_two_files_of_poses(written, poses, tmp_path):
+def test_two_files_of_poses_plans_and_flips_are_those_of_the_command(written, poses, tmp_path):
     read, names = stcal.load_table(poses), [f"p{i}" for i in range(8)]
     board = read.poses("camera_from_board_")
     robot = table(tmp_path / "robot.csv", {"": read.poses("base_from_flange_")}, image=names)
@@ -99,9 +95,6 @@ def test_two_files_of_poses(written, poses, tmp_path):
     found = workflows.calibrate_handeye(given, "pose", repeats=0)
     assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
     assert given.notes == (f"1 rows of {camera} have no partner: image p99",)
-
-
-def test_plan_and_flips_are_those_of_the_command(written, poses):
     answer = written("plan", poses, "--count", 1)
     found = workflows.plan_handeye(workflows.read_handeye(poses), 1)
     assert json.loads(json_text(HandEyePlanFile.of(found.result, found.poses, found.joints))) == answer

@@ -88,7 +88,7 @@ def test_what_is_wrong_with_the_data_is_said(charuco):
 
 
 @pytest.mark.slow
-def test_a_seed(capsys):
+def test_a_seed_and_a_trial(capsys):
     study = load_script("reproduce_handeye")
     found = study.trial(3)
     for method in METHODS:
@@ -105,11 +105,6 @@ def test_a_seed(capsys):
     assert closed < 1.001
     study.print_tables([found])
     assert "| about the closed form: ±10°, ±20 mm |" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_trial():
-    """The square of six numbers of σ 1 is below 34 but once in 10⁵."""
     trial, method = load_script("handeye_study").camera_trial, "reprojection, camera solved for"
     by_sigma, off_mm2 = trial(method, "eye-to-hand", "camera ≈ robot", 1.0, 3)
     assert 0.1 < by_sigma < 34

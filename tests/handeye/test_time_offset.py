@@ -154,10 +154,18 @@ def test_a_cubic_meets_the_swing_by_samples_in_any_order_and_at_both_ends():
     assert np.abs(found.at(ends).difference(swing(ends, PHASE))).max() < 1e-4
 
 
-def test_noise_of_samples_is_told():
+def test_noise_of_samples_is_told_and_there_may_be_more_images_than_samples():
     """196 samples that miss the cubic through their neighbours: σ to 5 %; lengths of three numbers, √3 σ."""
     turn, shift = stream(noise=(1e-4, 0.05)).rest()
     assert [turn, shift] == pytest.approx([np.sqrt(3) * 1e-4, np.sqrt(3) * 0.05], rel=0.2)
+    times = np.arange(5) * 0.1
+    samples = swing(times, PHASE)
+    places = tuple(f"line {k + 2}" for k in range(5))
+    robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
+    seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
+    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
+    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
+    assert np.abs(at.poses.difference(swing(seconds, PHASE))).max() < 0.01
 
 
 def test_what_is_taken_is_said():
@@ -191,14 +199,3 @@ def test_names_that_are_times_and_streams_that_are_none():
     assert time_of("nan") is None
     for times, error in (([1], "E-TIMES-FEW … 1"), ([1, 2, 1], "E-TIMES-REPEATED … 1")):
         refuses(error, Stream.of, list(map(Decimal, times)), swing(np.array(times) * 1.0, PHASE), "robot.csv")
-
-
-def test_more_images_than_samples():
-    times = np.arange(5) * 0.1
-    samples = swing(times, PHASE)
-    places = tuple(f"line {k + 2}" for k in range(5))
-    robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
-    seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
-    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
-    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
-    assert np.abs(at.poses.difference(swing(seconds, PHASE))).max() < 0.01

@@ -54,12 +54,18 @@ def test_the_chain_is_the_product_and_covariances_of_the_robot_add_up(files):
     assert (np.diag(more - plain)[3:] > 0.04).all()
 
 
-def test_a_fixed_camera_needs_no_robot_poses(files, tmp_path):
+def test_a_fixed_camera_needs_no_robot_poses_and_a_registration_leads_to_the_base_too(files, tmp_path):
     fixed = tmp_path / "fixed.json"
     fixed.write_text(json.dumps({"base_from_camera": MOUNT.matrix().tolist(), "covariance": None}))
     goal = read_chain(fixed, None).base_from_goal("any", SEEN)
     assert np.allclose(goal.rigid.matrix(), (MOUNT @ SEEN.rigid).matrix())
     refuses("E-OPTION-NEEDS … fixed.json … the camera is fixed", read_chain, fixed, files[1])
+    file = registered(tmp_path / "register.json", MOUNT.matrix())
+    goal = goal_chain(registration=file, offset=files[2]).base_from_goal("any", SEEN)
+    mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
+    wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
+    assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
+    assert np.allclose(goal.covariance, wanted.covariance)
 
 
 def registered(path, b_from_a, model="rigid", covariance=None):
@@ -67,15 +73,6 @@ def registered(path, b_from_a, model="rigid", covariance=None):
     content["covariance"] = (np.eye(6) * 1e-6 if covariance is None else covariance).tolist()
     path.write_text(json.dumps(content))
     return path
-
-
-def test_a_registration_leads_to_the_base_too(files, tmp_path):
-    file = registered(tmp_path / "register.json", MOUNT.matrix())
-    goal = goal_chain(registration=file, offset=files[2]).base_from_goal("any", SEEN)
-    mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
-    wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
-    assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
-    assert np.allclose(goal.covariance, wanted.covariance)
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_tags_of_another_target_are_named_and_a_camera_file_of_another_camera_is
     assert in_scene(seen, LAYOUT, model).verdict.decision == "reject"
 
 
-def test_an_id_twice_in_view(located):
+def test_an_id_twice_in_view_and_a_scene_that_moved_are_rejected(located, plain):
     printed = sheet()
     side = slice(int((SHEET_MM[1] / 2 - 50) * PER_MM) - 30, int((SHEET_MM[1] / 2 - 30) * PER_MM) + 30)
     across = slice(int((SHEET_MM[0] / 2 + 50) * PER_MM) - 30, int((SHEET_MM[0] / 2 + 70) * PER_MM) + 30)
@@ -98,6 +98,12 @@ def test_an_id_twice_in_view(located):
     result = located([photo(TRUTH, printed)])
     assert result.verdict.decision == "reject"
     assert result.verdict.reasons == ("tags seen twice: 11; every id once in view needed; cover the copy",)
+    matrix = np.array([[1.0, 0, 1.0], [0, 1, 0]])
+    turned = cv2.warpAffine(plain, matrix, plain.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    result = located([*expose(plain, [0.5, 1.0]), *expose(turned, [0.7])])
+    assert result.verdict.decision == "reject"
+    assert result.verdict.reasons[0].startswith("the scene moved between")
+    assert result.pose is None
 
 
 def test_images_of_another_size(located, plain):
@@ -116,15 +122,6 @@ def test_scenes_of_a_folder(tmp_path, plain):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), plain[:20, :20])
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path)] == [("far", 2), ("near", 2)]
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path / "far" / "1.png")] == [("1", 1)]
-
-
-def test_a_scene_that_moved(located, plain):
-    matrix = np.array([[1.0, 0, 1.0], [0, 1, 0]])
-    turned = cv2.warpAffine(plain, matrix, plain.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    result = located([*expose(plain, [0.5, 1.0]), *expose(turned, [0.7])])
-    assert result.verdict.decision == "reject"
-    assert result.verdict.reasons[0].startswith("the scene moved between")
-    assert result.pose is None
 
 
 def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):

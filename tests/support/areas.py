@@ -1,5 +1,5 @@
-"""Boards rendered by area: each pixel holds the exact share of it that is black, then blur, noise and rounding. Ellipses
-of circles in images, exact and as a detector with noise would measure their centres."""
+"""Boards rendered by area: each pixel holds the exact share of it that is black, then blur, noise and rounding.
+Ellipses of circles in images, exact and as a detector with noise would measure their centres."""
 
 from collections.abc import Sequence
 

@@ -184,7 +184,7 @@ def test_scenery_is_out_of_focus_too(scene):
     assert steepest(ThinLens(1.4, 24.0, 700.0)) < 0.5 * steepest(None)
 
 
-def test_truth_states_lens_and_rim(scene):
+def test_truth_states_lens_and_rim_and_impossible_ones_are_refused(scene):
     plain = TruthFile.of(scene).content()
     assert "optics" not in plain
     options = RenderOptions(lens=ThinLens(4.0, 24.0, 900.0), rim_mm=-0.2)
@@ -193,9 +193,6 @@ def test_truth_states_lens_and_rim(scene):
     assert stated.pop("optics") == {"lens": lens, "rim_mm": -0.2}
     assert stated == json.loads(json.dumps(plain))
     assert TruthFile.of(scene, options=RenderOptions(rim_mm=0.3)).content()["optics"] == {"rim_mm": 0.3}
-
-
-def test_refusals(scene):
     refuses("E-SIMULATE-OPTIONS … f_number … 0", ThinLens, 0.0, 24.0, 900.0)
     refuses("E-SIMULATE-OPTIONS … 20 mm … 24 mm", ThinLens, 4.0, 24.0, 20.0)
     refuses("E-FIELD-TYPE … rim_mm", RenderOptions, rim_mm=float("nan"))
@@ -222,7 +219,7 @@ def test_brightness_follows_time_as_do_saturation_and_noise():
     assert dark.std() == pytest.approx(expected[0], rel=0.05)
 
 
-def test_light_falls_off_and_glares():
+def test_light_falls_off_and_glares_the_same_by_the_same_seed_and_what_cannot_be_exposed_is_refused():
     photograph = np.full((400, 200), 64, np.uint8)
     (graded,) = expose(photograph, [1.0], Light(stops=2.0))
     columns = graded.mean(0)  # noise of a grey level, of 400 rows
@@ -232,9 +229,6 @@ def test_light_falls_off_and_glares():
     near = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 20.0**2)).mean() ** 2  # of the Gaussian's peak, over 11 × 11 px
     assert spot[195:206, 45:56].mean() - columns[100] == pytest.approx(127.5 * near, rel=0.01)
     assert spot[195:206, 145:156].mean() == pytest.approx(columns[100], rel=0.005)
-
-
-def test_the_same_seed_gives_the_same_images_and_what_cannot_be_exposed_is_refused():
     first, again, other = (expose(RAMP, [1.0], seed=seed)[0] for seed in (3, 3, 4))
     assert (first == again).all()
     assert (first != other).any()

@@ -75,14 +75,11 @@ def test_determined_by_the_seeds_and_options_that_are_checked(scene):
     refuses("E-SIMULATE-OPTIONS … noise … -1", RenderOptions, noise=-1)
 
 
-def test_noise_has_the_spread_asked_for(second):
+def test_circles_are_bright_or_dark_as_designed_and_noise_has_the_spread_asked_for(second, scene):
     quiet = render(second, "top-left", 0, PLAIN).astype(float)
     noisy = render(second, "top-left", 0, replace(PLAIN, noise=0.02)).astype(float)
     middle = (quiet > 20) & (quiet < 235)
     assert 0.98 < np.std((noisy - quiet)[middle]) / (0.02 * 255) < 1.02  # rounding adds 0.3 %
-
-
-def test_circles_are_bright_or_dark_as_designed(scene, second):
     for made, group, low, high in ((scene, "15", 170, 190), (second, "top-right", 15, 35)):
         picture, seen = render(made, group, 0, PLAIN), image_circles(made, group, 0)
         x, y = np.rint(seen.centre_px[seen.must_find]).astype(int).T

@@ -40,7 +40,7 @@ def scene(request):
     return make_scene(OPTIONS) if request.param == "reference" else make_scene(OPTIONS, *second_design())
 
 
-def test_poses_are_three_point_frames_of_the_circles(scene):
+def test_poses_are_three_point_frames_of_circles_that_differ_from_design_as_much_as_asked(scene):
     for face in scene.target.faces:
         origin, on_x, on_y = (scene.circles_target[f"{face.id}:{c}"] for c in (face.origin, face.x, face.y))
         local = scene.target_from_face[face.id].inverse() @ np.array([origin, on_x, on_y])
@@ -49,9 +49,6 @@ def test_poses_are_three_point_frames_of_the_circles(scene):
         assert local[1, 0] > 0
         assert local[2, 1] > 0
     np.testing.assert_allclose(scene.target_from_face[scene.reference_face].matrix(), np.eye(4), atol=1e-12)
-
-
-def test_made_differs_from_design_as_much_as_asked(scene):
     off = []
     for face in scene.target.faces:
         local = scene.target_from_face[face.id].inverse() @ scene.face_circles(face.id)
@@ -95,7 +92,7 @@ def test_every_view_shows_both_faces_and_the_board_beside_them(scene):
             assert gap.max() > 10, name  # px; a line separates the two
 
 
-def test_views_spread_widely(scene):
+def test_views_spread_widely_and_are_the_same_of_the_same_seed(scene):
     for name, g in scene.groups.items():
         middle = np.vstack([scene.face_circles(face) for face in g.faces]).mean(0)
         away = np.array([pose.inverse().translation - middle for pose in g.camera_from_target])
@@ -104,9 +101,6 @@ def test_views_spread_widely(scene):
         direction = away / distance[:, None]
         widest = np.degrees(np.arccos((direction @ direction.T).min()))
         assert 40 < widest < 115, name
-
-
-def test_same_seed_same_scene_and_other_seed_another(scene):
     again = make_scene(OPTIONS) if scene.reference_face == "1" else make_scene(OPTIONS, *second_design())
     other = make_scene(replace(OPTIONS, seed=4))
     np.testing.assert_equal(again.circles_target, scene.circles_target)
@@ -257,12 +251,21 @@ def test_data_set_on_disk(tmp_path, workers):
     assert json.loads((folder / "truth.json").read_text()) == TruthFile.of(small).content()
 
 
-def test_png_holds_the_image_exactly(tmp_path):
+def test_png_holds_the_image_exactly_and_another_seed_photographs_the_same_body_again(tmp_path):
     small = make_scene(SceneOptions(seed=5, width=324, height=216, images_per_group=1, groups=(("1", "2"),)))
     (path,) = write_dataset(tmp_path, small, RenderOptions(bit_depth=16), image_format="png", workers=1)
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert picture.dtype == np.uint16
     np.testing.assert_array_equal(picture, render(small, "12", 0, RenderOptions(bit_depth=16)))
+    first, again, other = (
+        make_scene(SceneOptions(seed=seed, body_seed=own, one_board=True))
+        for seed, own in ((3, None), (4, 3), (4, None))
+    )
+    assert str(first.target_from_face) == str(again.target_from_face) != str(other.target_from_face)
+    assert np.array_equal(first.camera.parameters(), again.camera.parameters())
+    group, taken_again = (each.groups["12"] for each in (first, again))
+    assert not np.array_equal(group.board_circles_target, taken_again.board_circles_target)
+    assert group.camera_from_target[0] != taken_again.camera_from_target[0]
 
 
 def test_refusals_and_a_data_set_that_fails_leaves_no_folder(tmp_path, small):
@@ -280,18 +283,6 @@ def test_refusals_and_a_data_set_that_fails_leaves_no_folder(tmp_path, small):
     with pytest.raises(RuntimeError, match="no"):
         write_dataset(folder, small, workers=2, progress=fails)
     assert not folder.exists()
-
-
-def test_another_seed_photographs_the_same_body_again():
-    first, again, other = (
-        make_scene(SceneOptions(seed=seed, body_seed=own, one_board=True))
-        for seed, own in ((3, None), (4, 3), (4, None))
-    )
-    assert str(first.target_from_face) == str(again.target_from_face) != str(other.target_from_face)
-    assert np.array_equal(first.camera.parameters(), again.camera.parameters())
-    group, taken_again = (each.groups["12"] for each in (first, again))
-    assert not np.array_equal(group.board_circles_target, taken_again.board_circles_target)
-    assert group.camera_from_target[0] != taken_again.camera_from_target[0]
 
 
 TIE_MM = 70.0  # side of a cube whose tags have edges in the middle between two pixels of their drawing
@@ -350,7 +341,7 @@ def test_print_is_off_by_what_the_truth_says(target):
     assert max(errors) < 0.5  # bends of 0.3 mm and more turn what is near the horizon by more
 
 
-def test_a_tag_that_is_tilted_too_far_is_named():
+def test_a_tag_that_is_tilted_too_far_is_named_and_the_share_that_an_area_covers_is_exact():
     """A body of two tags, one facing the camera and the other tilted by 75°."""
     target = tag_cube(60.0)
     scene = make_body_scene(target, body_camera(720), BodyOptions(images=1, distance_mm=300.0, noise=0.0, seed=1))
@@ -363,9 +354,6 @@ def test_a_tag_that_is_tilted_too_far_is_named():
     (note,) = [note for note in notes if "tilted" in note]
     assert note.startswith(f"face {face}: a tag is tilted by 7")
     assert "up to 70° is measured" in note
-
-
-def test_the_share_that_an_area_covers_is_exact():
     line = np.array([[2.25, 1.5], [7.5, 1.5], [7.5, 6.75], [2.25, 6.75]])
     ends = ((10, 2.25, 7.5), (9, 1.5, 6.75))
     x, y = (np.clip(np.minimum(np.arange(n) + 1, b) - np.maximum(np.arange(n), a), 0, 1) for n, a, b in ends)

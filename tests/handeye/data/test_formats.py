@@ -163,7 +163,7 @@ def test_the_setup_that_a_file_states_is_taken(command, tmp_path):
 EIGHT = simulated(np.random.default_rng(1), 8, camera=(1e-3, 0.3))
 
 
-def test_bad_cells_and_sides_are_named(tmp_path):
+def test_bad_cells_and_sides_identical_poses_a_board_that_did_not_follow_and_false_matrices_are_named(tmp_path):
     for row, column, cell, error in (
         (2, 0, "nan", "E-TABLE-NUMBER … 4 … base_from_flange_x_mm … 'nan'"),
         (5, 13, "3", "E-QUATERNION-LENGTH … line 7"),
@@ -175,17 +175,10 @@ def test_bad_cells_and_sides_are_named(tmp_path):
     every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
     for sides, fault in (({"base_from_flange": flange}, "no such columns … camera_from_board"), (every, "both … base")):
         refuses(f"E-TABLE-COLUMN-MISSING … {fault}", read_poses, table(tmp_path / "a.csv", sides))
-
-
-def test_identical_poses_and_a_board_that_did_not_follow_are_named(tmp_path):
     rows = [0, 1, 2, 3, 1, 5]
     same = table(tmp_path / "poses.csv", {name: poses[rows] for name, poses in sides_of(EIGHT.pairs).items()})
     refuses("E-POSES-IDENTICAL … line 3 and line 6", read_poses, same)
-    flange, board = EIGHT.pairs.base_from_flange, EIGHT.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
-    refuses("E-POSES-IDENTICAL … pose 4 and pose 5", HandEyePoses, flange, board)
-
-
-def test_matrices_are_checked_one_by_one():
+    refuses("E-POSES-IDENTICAL … pose 4 and pose 5", HandEyePoses, flange, board[[0, 1, 2, 3, 3, 5, 6, 7]])
     flange = [p.matrix() for p in EIGHT.pairs.base_from_flange]
     board = [p.matrix() for p in EIGHT.pairs.camera_from_board]
     same = HandEyePoses.from_matrices(flange, board)

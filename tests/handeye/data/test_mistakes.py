@@ -64,11 +64,18 @@ def test_the_unit_is_asked_for(tmp_path, farthest):
     assert "cm as you say" in stated.understood
 
 
-def test_two_sides_in_two_units_are_refused(tmp_path):
+def test_two_sides_in_two_units_are_refused_and_a_direction_that_the_file_states_is_not_changed(tmp_path):
     np.savez(tmp_path / "p.npz", base_from_flange=GOOD, camera_from_board=in_metres(PAIRS.camera_from_board))
     assert "the robot's lengths are in mm and the camera's in m" in refused(tmp_path / "p.npz", call=read_pairs)
     told = read_pairs(tmp_path / "p.npz", Said.of_options([], ["camera=m", "robot=mm"], []))
     assert np.abs(told.pairs.camera_from_board.difference(PAIRS.camera_from_board)).max() < 1e-9
+    np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=PAIRS.camera_from_board.matrix())
+    said = Said(frames=("base_from_flange",))
+    told = refused(tmp_path / "p.npz", said, read_pairs)
+    assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in told
+    np.save(tmp_path / "p.npy", GOOD)
+    turned = read_robot(tmp_path / "p.npy", Said(frames=("flange_from_base",)))
+    assert turned.poses.inverse().translation == pytest.approx(GOOD[:, :3, 3])
 
 
 def saved(array, **options) -> bytes:
@@ -155,16 +162,6 @@ def test_bad_conventions_and_options_are_named(tmp_path):
         ("E-OPTION-VALUE … one of each side", [], [], ["base_from_flange", "flange_from_base"]),
     ):
         refuses(error, Said.of_options, *options)
-
-
-def test_a_direction_that_the_file_states_is_not_changed(tmp_path):
-    np.savez(tmp_path / "p.npz", flange_from_base=GOOD, camera_from_board=PAIRS.camera_from_board.matrix())
-    said = Said(frames=("base_from_flange",))
-    told = refused(tmp_path / "p.npz", said, read_pairs)
-    assert "flange_from_base by its name flange_from_base, --poses-are base_from_flange" in told
-    np.save(tmp_path / "p.npy", GOOD)
-    turned = read_robot(tmp_path / "p.npy", Said(frames=("flange_from_base",)))
-    assert turned.poses.inverse().translation == pytest.approx(GOOD[:, :3, 3])
 
 
 def test_the_file_of_the_other_side_and_samples_without_one_side_are_named(tmp_path):

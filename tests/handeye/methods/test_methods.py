@@ -113,8 +113,9 @@ def test_wrong_arguments_and_options():
     refuses("E-SIGMA-VALUE", Noise, 0.0, 0.1, 0.0, 0.1)
 
 
-def test_park_and_martin_as_they_wrote_it():
-    """R_X = (MᵀM)^(−1/2) Mᵀ with M = Σ β αᵀ over all pairs of poses."""
+def test_park_and_martin_as_they_wrote_it_and_every_name_is_a_method_of_its_own():
+    """R_X = (MᵀM)^(−1/2) Mᵀ with M = Σ β αᵀ over all pairs of poses. On noisy poses no two methods agree, and the
+    separable ones share what they share: the translation's equations."""
     truth = simulated(np.random.default_rng(11), 9, camera=(2e-3, 0.3))
     motions = Motions.all(Loop.of(truth.pairs, "eye-in-hand"))
     m = motions.beta.T @ motions.alpha
@@ -128,10 +129,6 @@ def test_park_and_martin_as_they_wrote_it():
         rcond=None,
     )[0]
     assert found.translation == pytest.approx(shift, abs=1e-6)
-
-
-def test_every_name_is_a_method_of_its_own():
-    """On noisy poses no two agree, and the separable methods share what they share: the translation's equations."""
     truth = simulated(np.random.default_rng(12), 9, camera=(2e-3, 0.3))
     found = {method: handeye(truth.pairs, method=method).mount_from_camera for method in FROM_POSES}
     for one, other in combinations(found, 2):

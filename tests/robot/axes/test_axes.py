@@ -203,13 +203,6 @@ def test_a_value_in_another_joints_column_is_named_not_the_axis(swept, quick):
     assert [row.d for row in found.robot.rows] == pytest.approx([row.d for row in clean.robot.rows], abs=0.2)
 
 
-def test_a_row_without_a_target_is_named(swept, quick):
-    names = list(swept.targets)
-    names[40] = ""
-    notes = robot_from_sweeps(replace(swept, targets=tuple(names)), mh80()).notes
-    assert any(f"line {swept.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
-
-
 @pytest.mark.parametrize("off_mm", sampled([0.5, 20.0, 300.0, 2000.0]))
 def test_a_gross_error_is_named_and_left_out(off_mm, quick):
     nominal = mh80()
@@ -224,7 +217,7 @@ def test_a_gross_error_is_named_and_left_out(off_mm, quick):
         assert abs(one.distance_mm - two.distance_mm) < 3 * two.distance_sigma_mm  # one of 18 points less
 
 
-def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing(quick):
+def test_a_reflector_on_the_axis_says_nothing_and_a_row_without_a_target_is_named(quick, swept):
     nominal = mh80()
     true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})
     result = robot_from_sweeps(measured(true, sweep_values(nominal), SIGMA), nominal)
@@ -234,6 +227,10 @@ def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing(quick):
     assert np.abs(error[2:]).max() < 5 * np.sqrt(np.diag(result.fits[5].covariance)[2:].max())
     alone = replace(true, tools={"D": true.tools["D"]})
     refuses("E-AXES-UNDETERMINED … 6:", robot_from_sweeps, measured(alone, sweep_values(nominal), SIGMA), nominal)
+    names = list(swept.targets)
+    names[40] = ""
+    notes = robot_from_sweeps(replace(swept, targets=tuple(names)), mh80()).notes
+    assert any(f"line {swept.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
 
 
 def test_full_turns_and_arcs_too_short_to_use(quick):
@@ -287,13 +284,20 @@ def test_the_arms_that_cannot_be_had(swept, quick):
     refuses("E-AXES-JOINT-VALUES", robot_from_sweeps, replace(good, q=np.radians(good.q)), nominal, 1e-6)
 
 
-def test_exactly_parallel_axes_have_no_common_normal(quick):
+def test_exactly_parallel_axes_have_no_common_normal_and_both_errors_are_alike_at_the_length(quick):
     nominal = mh80()
     result = robot_from_sweeps(measured(placed(nominal, Rigid(), TOOLS), sweep_values(nominal)), nominal)
     pair = result.pairs[1]
     assert pair.parallel
     assert pair.distance_mm == pytest.approx(870, abs=1e-8)
     assert pair.refused
+    true = arm(mh80())
+    data = posed(true, sweep_values(true, 3))
+    assert length_of(data) == pytest.approx(LENGTH_MM)
+    assert length_of(replace(data, covariance=None)) is None
+    with fails_with("E-MEASURED-NO-ORIENTATION"):
+        robot_from_sweeps(measured(true, sweep_values(true, 3)), nominal, places=ring(100.0))
+    refuses("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000", ring, 0.1)
 
 
 def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(shared_data, tmp_path):
@@ -351,16 +355,6 @@ def test_orientations_give_the_pose_of_the_target_too(quick):
     here = result.robot.world_from_base @ forward(result.robot, q, "A")
     assert np.abs(here.difference(there)[:, 3:]).max() < 1e-8
     assert np.abs(here.difference(there)[:, :3]).max() < 1e-10
-
-
-def test_the_length_is_that_at_which_both_errors_are_alike():
-    true = arm(mh80())
-    data = posed(true, sweep_values(true, 3))
-    assert length_of(data) == pytest.approx(LENGTH_MM)
-    assert length_of(replace(data, covariance=None)) is None
-    with fails_with("E-MEASURED-NO-ORIENTATION"):
-        robot_from_sweeps(measured(true, sweep_values(true, 3)), mh80(), places=ring(100.0))
-    refuses("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000", ring, 0.1)
 
 
 @pytest.mark.full

@@ -53,7 +53,7 @@ def test_zeros_alone_are_found_and_nothing_else_moves():
     assert identify(mh80(), data[:4], IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
-def test_fixed_dimensions_stay_and_are_said(tmp_path):
+def test_fixed_dimensions_stay_and_are_said_and_names_of_what_is_adjusted(tmp_path):
     true, data = seen_arm(np.random.default_rng(2), 40)
     assert abs(true.rows[1].a - mh80().rows[1].a) > 0.01
     joints = list(mh80().joints)
@@ -64,9 +64,6 @@ def test_fixed_dimensions_stay_and_are_said(tmp_path):
     assert found.robot.rows[1].a == pytest.approx(mh80().rows[1].a, abs=1e-3)
     assert any("a of row 2 (measured on a CMM)" in note for note in found.notes)
     assert found.all_held_out is not None
-
-
-def test_names_of_what_is_adjusted():
     for text in ("base,tool", "zeros", "geometry", "all"):
         assert adjusted(text) == text
     assert adjusted("tool, base") == "base,tool"
@@ -167,7 +164,8 @@ def drawn(rows: int, share: float, seed: int, observe: str = "pose"):
     return true, data if observe == "pose" else replace(data, rotations=None)
 
 
-def test_six_poses_for_thirty_parameters_are_said():
+def test_six_poses_for_thirty_parameters_and_rows_of_a_small_part_of_the_ranges_are_said():
+    """All parameters count as determined; what is least known is named with its σ."""
     found = identify(mh80(), drawn(6, 0.6, 0)[1], IdentifyOptions(repeats=1))
     assert found.rank == 30
     assert found.held_out is None
@@ -176,10 +174,6 @@ def test_six_poses_for_thirty_parameters_are_said():
     assert "times that at the measured rows" in found.notes[-1]
     more = identify(mh80(), drawn(8, 0.6, 0)[1], IdentifyOptions(folds=0))
     assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in more.notes)
-
-
-def test_rows_of_a_small_part_of_the_ranges_are_said_and_none_over_them():
-    """All parameters count as determined; what is least known is named with its σ."""
     found = identify(mh80(), drawn(40, 0.03, 1)[1], IdentifyOptions(folds=0))
     assert found.rank == 30
     assert rms(found.predicted.ranges_mm) > 20 * rms(found.predicted.here_mm)

@@ -93,7 +93,7 @@ def test_a_coupling_of_the_wrist_is_no_gravity_and_two_causes_are_two_findings()
     assert found[0].share > found[1].share
 
 
-def test_the_effect_is_what_was_put_in():
+def test_the_effect_is_what_was_put_in_and_neither_rounding_nor_too_few_rows_tell_anything():
     """Twice a turn of joint 1: 0.2 mrad at the tool's distance from the axis, of which parameters take up a fifth."""
     true, data = bent(6, 200, {1: lambda q, _: 2e-4 * twice(q[:, 0])})
     [finding] = left_of(true, data, "position")
@@ -103,6 +103,8 @@ def test_the_effect_is_what_was_put_in():
     assert 0.7 * put_in < finding.effect_mm < put_in
     assert 0.3 < finding.share < 0.95
     assert finding.sentence().endswith("p < 0.001")
+    assert left_of(*simulated(8, 40, 0, 0), "position") == ()
+    assert left_of(*simulated(9, 12), "position") is None
 
 
 JUMP = Rigid.exp([0, 0, 2e-3, 0.6, -0.8, 0])
@@ -159,7 +161,7 @@ def test_a_target_that_slipped_a_joint_that_lost_its_zero_and_a_drift_are_told_a
 
 
 @pytest.mark.slow
-def test_identify_tells_that_the_instrument_moved_and_a_station_mends_it():
+def test_identify_tells_that_the_instrument_moved_and_what_is_not_seen_of_base_and_tool_has_no_sigma():
     """Half of the rows moved by 10 mm, which neither errors nor the arm explain."""
     true, data = simulated(15, 60)
     data = moved_from(30, data, Rigid.exp([0, 0, 5e-3, 6, -8, 0]))
@@ -171,11 +173,17 @@ def test_identify_tells_that_the_instrument_moved_and_a_station_mends_it():
     mended = identify(nominal, replace(data, stations=("A",) * 30 + ("B",) * 30), QUICK)
     assert mended.left == ()
     assert mended.fitted_mm.mean() < 0.2 < 2 < found.fitted_mm.mean()
-
-
-def test_without_noise_rounding_is_not_told_and_of_too_few_rows_nothing():
-    assert left_of(*simulated(8, 40, 0, 0), "position") == ()
-    assert left_of(*simulated(9, 12), "position") is None
+    data = simulated(11, 45)[1]
+    position = identify(mh80(), data, replace(QUICK, observe="position"))
+    base, tool = position.placed
+    assert np.isfinite(base.sigma).all()
+    assert np.isnan(tool.sigma[:3]).all()
+    assert (tool.sigma[3:] > 0).all()
+    distances = identify(mh80(), of_distances(data), QUICK)
+    assert distances.rank == 21
+    base, tool = distances.placed
+    assert np.isnan(base.sigma).all()
+    assert (tool.sigma[3:] > 0).all()
 
 
 @pytest.mark.full
@@ -193,21 +201,6 @@ def test_sigma_of_base_and_tool_is_that_of_their_errors():
     assert np.mean(squares) == pytest.approx(1, abs=0.25)  # 480 numbers, of which those of one arm go together
 
 
-@pytest.mark.slow
-def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
-    data = simulated(11, 45)[1]
-    position = identify(mh80(), data, replace(QUICK, observe="position"))
-    base, tool = position.placed
-    assert np.isfinite(base.sigma).all()
-    assert np.isnan(tool.sigma[:3]).all()
-    assert (tool.sigma[3:] > 0).all()
-    distances = identify(mh80(), of_distances(data), QUICK)
-    assert distances.rank == 21
-    base, tool = distances.placed
-    assert np.isnan(base.sigma).all()
-    assert (tool.sigma[3:] > 0).all()
-
-
 WEIGHTING = Weighting(0.05, 2e-4)
 
 
@@ -222,7 +215,7 @@ def case():
     return start, observed(data)
 
 
-def test_it_ends_where_the_weighted_gradient_is_zero(case):
+def test_it_ends_where_the_weighted_gradient_is_zero_or_with_an_error(case, monkeypatch):
     """In units of its own σ, and of Huber's cost: weight times residual."""
     state, seen = case
     found = ArmProblem(seen, WEIGHTING).solve(state)
@@ -235,6 +228,10 @@ def test_it_ends_where_the_weighted_gradient_is_zero(case):
     gradient = np.einsum("r,ri,rik->k", found.weights, white, slope)
     sigma = np.sqrt(np.diag(np.linalg.inv(found.equations.normal)))
     assert np.abs(gradient * sigma).max() < 1e-2
+    monkeypatch.setattr(problem, "MAX_STEPS", 1)
+    count = state.jacobian(seen).shape[2]
+    far = state.moved(np.full(count, 0.05), seen.kind)
+    refuses("E-NO-MINIMUM … identification … 1", ArmProblem(seen, WEIGHTING).solve, far)
 
 
 def test_what_is_common_to_all_observations_is_whitened_too():
@@ -254,14 +251,6 @@ def test_what_is_common_to_all_observations_is_whitened_too():
     values = rng.normal(size=(5, 6))  # and half the derivative of their squares is the inverse of Σ times them
     pull = Weighting(1.0, 1.0, given=True).pull(Weighting(1.0, 1.0, given=True).whiten(values, seen), seen)
     np.testing.assert_allclose((full + flat @ flat.T) @ pull.ravel(), values.ravel(), atol=1e-9)
-
-
-def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
-    state, seen = case
-    monkeypatch.setattr(problem, "MAX_STEPS", 1)
-    count = state.jacobian(seen).shape[2]
-    far = state.moved(np.full(count, 0.05), seen.kind)
-    refuses("E-NO-MINIMUM … identification … 1", ArmProblem(seen, WEIGHTING).solve, far)
 
 
 @pytest.mark.parametrize("rows", [14, 24, 104])

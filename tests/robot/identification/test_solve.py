@@ -54,13 +54,26 @@ def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
     assert 0.05 < np.mean(squares) < 1.95
 
 
-def test_without_noise_the_arm_is_found_exactly():
+def test_without_noise_the_arm_is_found_exactly_and_one_whose_rows_are_singular_to_noise():
     true, data = simulated(1, 40, 0, 0)
     found = identify(mh80(), data, QUICK)
     q = joint_vectors(true, 50, np.random.default_rng(9))
     wanted, own = (flange_poses(robot.chain(), q) @ robot.tools[""] for robot in (true, found.robot))
     assert np.abs(wanted.difference(own)[:, 3:]).max() < 1e-7  # mm; rounding of 2 m over the condition of the data
     assert found.nominal_mm.mean() > 0.3
+    rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
+    arm = Robot("singular", "standard", rows, (Joint(),) * 6)
+    rng = np.random.default_rng(0)
+    q = joint_vectors(arm, 60, rng)
+    seen = flange_poses(arm.chain(), q)
+    positions = seen.translation + rng.normal(0, 0.05, (60, 3))
+    data = Measurements("d", range(2, 62), q, ("",) * 60, positions, seen.rotation)
+    found = identify(arm, data, replace(QUICK, sigma_mm=0.05, sigma_rad=1e-4))
+    assert found.rank == 30
+    # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
+    assert 0.06 < found.fitted_mm.mean() < 0.09
+    again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
+    assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 @pytest.mark.parametrize("tree", [False, True])
@@ -178,22 +191,6 @@ def test_data_that_cannot_be_right_are_named(spoil, kind, words):
     _, data = simulated(8, 40)
     with pytest.raises(kind, match=words):
         identify(mh80(), spoil(data), QUICK)
-
-
-def test_an_arm_whose_rows_are_singular_is_identified():
-    rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
-    arm = Robot("singular", "standard", rows, (Joint(),) * 6)
-    rng = np.random.default_rng(0)
-    q = joint_vectors(arm, 60, rng)
-    seen = flange_poses(arm.chain(), q)
-    positions = seen.translation + rng.normal(0, 0.05, (60, 3))
-    data = Measurements("d", range(2, 62), q, ("",) * 60, positions, seen.rotation)
-    found = identify(arm, data, replace(QUICK, sigma_mm=0.05, sigma_rad=1e-4))
-    assert found.rank == 30
-    # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
-    assert 0.06 < found.fitted_mm.mean() < 0.09
-    again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
-    assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 def test_rokae_held_out(rokae):

@@ -266,7 +266,7 @@ def test_a_file_reads_back_the_same_and_rows_made_of_a_chain_know_the_payload(tm
     assert np.abs(again - sag).max() < 1e-9
 
 
-def test_hysteresis_is_an_error_of_the_controllers_values():
+def test_hysteresis_is_an_error_of_the_controllers_values_and_masses_and_directions_that_cannot_be_are_refused():
     robot, rng = loose(), np.random.default_rng(5)
     q, came = vectors(robot), rng.choice([-1.0, 0.0, 1.0], (20, 6))
     chain = robot.chain()
@@ -274,9 +274,6 @@ def test_hysteresis_is_an_error_of_the_controllers_values():
     shifted = flange_poses(chain, q + robot.elasticity.hysteresis * came)
     assert np.abs(moved.difference(shifted)).max() < 1e-6
     assert np.abs(moved.difference(flange_poses(chain, q))[:, 3:]).max() > 0.1
-
-
-def test_masses_and_directions_that_cannot_be_are_refused():
     refuses("E-APPROACH-VALUE … 2", Conditions, approach=np.array([[1.0, 2.0]]))
     robot = bent()
     for mass in (-1.0, np.nan, 2e4, [1.0, 2.0]):
@@ -341,7 +338,8 @@ def test_the_pose_is_reached_from_a_near_start(name):
 
 
 @pytest.mark.slow
-def test_nearest_of_all_branches_and_turns():
+def test_nearest_of_all_branches_and_turns_and_where_two_almost_meet():
+    """Elbow nearly stretched: both elbow branches are within 0.1 rad of every reference, and a step leads to either."""
     robot = ARMS["made"]
     rng = np.random.default_rng(8)
     turn = 2 * np.pi
@@ -354,11 +352,6 @@ def test_nearest_of_all_branches_and_turns():
         turned = np.array([t for t in turned if (t >= low).all() and (t <= high).all()])
         expected = turned[np.linalg.norm(turned - near, axis=1).argmin()]
         np.testing.assert_allclose(inverse(robot, pose, near).q[0], expected, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_nearest_where_two_branches_almost_meet():
-    """Elbow nearly stretched: both elbow branches are within 0.1 rad of every reference, and a step leads to either."""
     free = replace(mh80(), joints=(Joint(),) * 6)
     stretched = -np.arctan2(1025, 210)  # of the forearm, where the elbow is straight
     q = np.array([0.3, 0.6, stretched + 0.01, 0.5, 0.8, -0.4])
@@ -376,7 +369,7 @@ def test_nearest_where_two_branches_almost_meet():
 
 
 @pytest.mark.slow
-def test_eight_branches_of_an_arm_with_a_spherical_wrist():
+def test_eight_branches_of_an_arm_with_a_spherical_wrist_and_what_remains_out_of_reach():
     """Shoulder, elbow and wrist: 2³ (Pieper 1968), where nothing limits them."""
     robot = replace(mh80(), joints=(Joint(),) * 6)
     rng = np.random.default_rng(4)
@@ -392,10 +385,6 @@ def test_eight_branches_of_an_arm_with_a_spherical_wrist():
         assert np.abs(apart).max(axis=1).min() < 1e-8
     assert max(counts) == 8
     assert set(counts) <= {2, 4, 8}
-
-
-@pytest.mark.slow
-def test_out_of_reach_is_named_with_what_remains():
     robot = ARMS["made"]
     q = joint_vectors(robot, 3, np.random.default_rng(6))
     poses = forward(robot, q)
@@ -468,7 +457,7 @@ def test_scara_reaches_what_four_joints_can_and_states_the_rest_of_tilted_axes()
         assert np.linalg.norm(forward(robot, q).difference(other)[:, :3]) > found.error_rad[0]
 
 
-def test_redundant_arm_needs_a_reference_and_stays_near_it():
+def test_a_redundant_arm_needs_a_reference_without_which_a_path_stays_in_its_branch():
     robot = seven()
     rng = np.random.default_rng(2)
     q = joint_vectors(robot, 100, rng, 0.9)
@@ -477,9 +466,6 @@ def test_redundant_arm_needs_a_reference_and_stays_near_it():
     assert np.abs(found.q - q).max() < 1
     refuses("E-ROBOT-REDUNDANT … 7", inverse, robot, forward(robot, q))
     refuses("E-ROBOT-REDUNDANT", branches, robot, forward(robot, q)[0])
-
-
-def test_without_reference_a_path_stays_in_its_branch_and_a_bad_one_is_named():
     robot = ARMS["made"]
     ends = np.array([[0.2, 0.3, -0.4, 0.5, 0.6, 0.7], [0.5, 0.5, -0.2, 0.8, 0.9, 0.4]])
     q = ends[0] + np.linspace(0, 1, 10)[:, None] * (ends[1] - ends[0])

@@ -43,25 +43,13 @@ def test_units_targets_and_distances_from_rows(tmp_path):
         data[:2]
 
 
-def test_poses_with_covariance(tmp_path):
+def test_poses_with_covariance_and_common_errors(tmp_path):
     covariance = np.diag([1e-8, 2e-8, 3e-8, 1e-4, 2e-4, 3e-4])
     rows = [["1", "2", *pose_cells(pose, covariance)] for pose in POSES]
     data = read(tmp_path, "\n".join(",".join(r) for r in [["q1_mm", "q2_rad", *POSE, *COVARIANCE], *rows]))
     assert np.abs(data.poses().difference(POSES)).max() < 1e-12
     assert data.covariance == pytest.approx(np.array([covariance] * 2))
     assert data[1:].covariance.shape == (1, 6, 6)
-
-
-def common_text(common, names=None):
-    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
-    covariance = np.diag([1e-8] * 3 + [1e-4] * 3)
-    columns = common_columns(common.shape[2]) if names is None else names
-    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
-    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
-    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
-
-
-def test_common_errors_of_poses(tmp_path):
     common = np.random.default_rng(0).normal(size=(2, 6, 3)) * 0.3 * np.repeat([1e-4, 1e-2], 3)[:, None]
     data = read(tmp_path, common_text(common))
     assert data.common == pytest.approx(common, rel=1e-5)
@@ -72,6 +60,15 @@ def test_common_errors_of_poses(tmp_path):
         read(tmp_path, common_text(common, ["common1_r", *common_columns(3)[1:]]))
     without = ",".join(["q1_mm,q2_deg", *POSE, *common_columns(1)]) + "\n1,2,0,0,0,1,0,0,0,0,0,0,0,0,0\n"
     refuses("E-TABLE-COVARIANCE", read, tmp_path, without)
+
+
+def common_text(common, names=None):
+    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
+    covariance = np.diag([1e-8] * 3 + [1e-4] * 3)
+    columns = common_columns(common.shape[2]) if names is None else names
+    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
+    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
+    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
 
 
 @pytest.mark.parametrize(
@@ -148,11 +145,18 @@ def test_angles_are_orientations(data, names, rotation):
     assert targets.notes == read.notes
 
 
-def test_the_order_of_quaternions_is_an_option(data):
+def test_the_order_of_quaternions_is_an_option_and_columns_that_nothing_reads_are_named(data):
     wxyz = data.seen.poses().quaternions()
     path = data.write("data.csv", POSE[3:], poses=Poses.from_quaternions(wxyz[:, [1, 2, 3, 0]], data.seen.points()))
     read = read_measurements(path, mh80(), quaternions="xyzw")
     assert np.abs(read.poses().difference(data.seen.poses())).max() < 1e-9
+    known = ("station", "faces", "circles", "rms_px", "chi2_per_dof", "commanded_x_mm", "nominal_q1_deg", "name")
+    assert read_measurements(data.write("data.csv", POSE[3:], *known), mh80()).notes == ()
+    alone = read_measurements(data.write("data.csv", (), "temperature"), mh80())
+    assert alone.notes == ("column not read: temperature",)
+    both = ("columns not read: w_deg, p_deg, r_deg, load",)
+    assert read_measurements(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
+    assert read_targets(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
 
 
 def test_an_open_convention_is_refused_and_a_needless_one_too(data):
@@ -165,16 +169,6 @@ def test_an_open_convention_is_refused_and_a_needless_one_too(data):
     alone, path = Robot("one", "standard", mh80().rows[:1], mh80().joints[:1]), data.folder / "d.csv"
     distances = written(path, "q1_deg,distance_mm\n1,2\n")
     refuses("E-OPTION-NEEDS", read_measurements, distances, alone, rotation="yaskawa")
-
-
-def test_columns_that_nothing_reads_are_named_and_the_known_ones_are_not(data):
-    known = ("station", "faces", "circles", "rms_px", "chi2_per_dof", "commanded_x_mm", "nominal_q1_deg", "name")
-    assert read_measurements(data.write("data.csv", POSE[3:], *known), mh80()).notes == ()
-    alone = read_measurements(data.write("data.csv", (), "temperature"), mh80())
-    assert alone.notes == ("column not read: temperature",)
-    both = ("columns not read: w_deg, p_deg, r_deg, load",)
-    assert read_measurements(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
-    assert read_targets(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
 
 
 @pytest.mark.slow
