@@ -48,6 +48,7 @@ from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import second_design, tag_body
 from tests.outcome import refuses
+from tests.shared import written
 from tests.support.areas import area_and_centroid
 
 PER_MM = 4
@@ -118,8 +119,7 @@ def seen_ways(image, places):
 @pytest.mark.parametrize("target", [reference_target(), second_design()[0]], ids=["bright", "dark"])
 def test_faces_are_read_back(target: TargetDesign, tmp_path):
     """Every page of the PDF, drawn by another program: all circles of its face named, at their places."""
-    (tmp_path / "target.toml").write_text(target_toml(target))
-    drawn = draw(tmp_path / "target.toml", tmp_path / "target.pdf")
+    drawn = draw(written(tmp_path / "target.toml", target_toml(target)), tmp_path / "target.pdf")
     pages = pages_of(drawn.path.read_bytes())
     assert len(pages) == len(target.faces)
     for sheet, page in zip(drawn.sheets, pages, strict=True):
@@ -387,9 +387,7 @@ def test_plates_meet_in_the_net_as_they_do_in_space_and_all_faces_are_read_from_
     assert all(len(each.circles) == 9 for each in found.faces)
 
 
-def test_plates_that_run_the_same_way_do_not_share_an_edge_and_what_lacks_an_outline_is_refused(
-    target, tmp_path
-):
+def test_plates_that_run_the_same_way_do_not_share_an_edge_and_what_lacks_an_outline_is_refused(target, tmp_path):
     """Two pages of a book: one would cover the other."""
     outline = [[-50, -50], [150, -50], [150, 150], [-50, 150]]
     pages = []

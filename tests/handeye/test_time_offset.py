@@ -20,6 +20,7 @@ from tests.handeye.photographed import BOARD
 from tests.handeye.test_cli import in_sigmas
 from tests.handeye.written import table, trajectory, two
 from tests.outcome import INPUT, assert_error, refuses
+from tests.shared import written
 from tests.support.handeye import StreamTruth, disturbed, handeye, simulated_stream, squared, swing
 
 
@@ -113,8 +114,7 @@ def test_dry_run_says_what_was_understood_of_times_of_names_and_of_a_file(comman
     assert "images: 4 of 4 with a pose of the robot" in shown
     (tmp_path / "named").mkdir()
     given = photographs(tmp_path / "named", ["a.png", "b.png", "c.png"], 100 + np.arange(40) * 0.02)
-    times = tmp_path / "times.csv"
-    times.write_text("image,time_s\na,100.105\nb.png,100.3\n")
+    times = written(tmp_path / "times.csv", "image,time_s\na,100.105\nb.png,100.3\n")
     code, shown, error = command(*given, "--dry-run", "--image-times", times)
     assert code == 0, error
     assert "1 at a sample, 1 interpolated" in shown

@@ -319,8 +319,7 @@ def test_a_path_that_cannot_be_read(tmp_path, name, message):
 
 @given(st.binary(max_size=80))
 def test_any_bytes_give_a_camera_or_one_line(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "any_camera"
-    path.write_bytes(content)
+    path = written(tmp_path_factory.getbasetemp() / "any_camera", content)
     with pytest.raises(InputError) as caught:  # 80 random bytes are no camera
         read_camera(path)
     assert len(str(caught.value).splitlines()) == 1

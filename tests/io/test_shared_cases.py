@@ -10,6 +10,7 @@ from stcal.io.cameras.read import camera_of_photograph, read_lens
 from tests.io import camera_files
 from tests.io.camera_files import project
 from tests.outcome import refuses
+from tests.shared import written
 
 RAYS = np.column_stack([np.random.default_rng(8).uniform(-0.5, 0.5, (40, 2)), np.ones(40)])
 RATIONAL = [0.41, -2.66, 0.0006, -0.0002, 1.52, 0.29, -2.48, 1.45]
@@ -74,8 +75,7 @@ def test_a_reported_stereo_file_of_matlab_has_both_cameras(shared_case):
 
 def test_the_reported_database_with_its_log_is_pycolmaps(shared_case, tmp_path):
     path = shared_case("wal/db.db")
-    (tmp_path / "db.db").write_bytes(path.read_bytes())
-    with pycolmap.Database.open(tmp_path / "db.db") as database:
+    with pycolmap.Database.open(written(tmp_path / "db.db", path.read_bytes())) as database:
         (theirs,) = database.read_all_cameras()
     wanted = np.array([theirs.img_from_cam(ray) for ray in RAYS]) - 0.5
     np.testing.assert_allclose(project(read_lens(path), RAYS), wanted, atol=1e-9)

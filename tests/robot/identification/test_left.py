@@ -1,25 +1,27 @@
 """What a model leaves: said of clean sets one time in a hundred, and named where there is something. The problem of an
-arm: its minimum, weights and variance components against closed forms of the textbook."""
+arm: its minimum, weights and variance components. Data in another convention than they say, which are refused."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stcal.adjust.blocks import Components, Equations
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification import problem
 from stcal.robot.identification.adjustment import State, Weighting, observed
 from stcal.robot.identification.identify import identify
 from stcal.robot.identification.problem import ArmProblem, Spread, huber_limit
 from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions
+from stcal.robot.identification.start import start
 from stcal.robot.identification.unexplained import left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_model import Robot, mh80
-from stcal.robot.simulated import joint_vectors, measured
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.levels import sampled
-from tests.outcome import refuses
+from tests.outcome import fails_with, refuses
 from tests.robot.identification.test_solve import of_distances, simulated
 from tests.support.arms import seen_arm
 
@@ -269,3 +271,131 @@ def test_one_sigma_is_that_of_least_squares_and_the_covariance_that_of_t(rows):
     wanted = left / (freedom - 2) * np.linalg.inv(design.T @ design)  # of a t distribution with so many degrees
     # three nodes are exact to the fourth order of the spread of log σ, 1 / √(2 · freedom)
     assert spread(sigma).covariance() == pytest.approx(wanted, rel=3 / freedom**2 + 1e-3)
+
+
+LAST = "quaternions were x, y, z, w in the order of their columns"
+
+
+def seen(seed: int, count: int, targets=("",)):
+    return simulated(seed, count, targets=targets)[1]
+
+
+def in_order(data, order, conjugated=False):
+    """The file as it is read when its quaternion columns hold other components than they say."""
+    wxyz = data.poses().quaternions() * ([1, -1, -1, -1] if conjugated else [1, 1, 1, 1])
+    return replace(data, rotations=Poses.from_quaternions(wxyz[:, order], data.points()).rotation)
+
+
+@pytest.mark.parametrize(
+    ("order", "conjugated", "said"),
+    [
+        ([1, 2, 3, 0], False, f"if {LAST}; give --quaternions xyzw"),
+        ([0, 1, 2, 3], True, "conjugated (the first frame seen from the second); change the sign of qw"),
+        ([1, 2, 3, 0], True, f"if {LAST}, and conjugated; give --quaternions xyzw and change the sign of qw"),
+    ],
+)
+def test_another_convention_is_named(order, conjugated, said):
+    data = seen(8, 8, ("a", "b"))
+    start(mh80(), data)
+    with fails_with("E-ROBOT-ORIENTATIONS") as caught:
+        start(mh80(), in_order(data, order, conjugated))
+    assert str(caught.value).endswith(said)
+
+
+def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
+    """One orientation in all rows, whatever the joints do."""
+    data = seen(1, 20)
+    still = np.tile(Rigid.exp([0.4, -0.3, 0.9, 0, 0, 0]).rotation, (20, 1, 1))
+    start(mh80(), replace(data, rotations=still))
+
+
+def turned(*quarters):
+    """The robot with quarters of a turn added to theta of its rows."""
+    rows = zip(mh80().rows, quarters, strict=True)
+    return replace(mh80(), rows=tuple(replace(row, theta=row.theta + k * np.pi / 2) for row, k in rows))
+
+
+WITH_ZERO = turned(0, 0, 0, -1, 0, 0)
+EXCHANGED = replace(mh80(), rows=tuple(mh80().rows[i] for i in (0, 2, 1, 3, 4, 5)))
+
+
+def as_it_is(q: np.ndarray) -> np.ndarray:
+    return q
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "change", "wrong", "named"),
+    [
+        (mh80(), as_it_is, [3, 20, 31], "lines 5, 22, 33 were not there … remove them"),
+        *sampled(
+            [
+                (replace(mh80(), convention="modified"), as_it_is, [], "standard convention"),
+                (WITH_ZERO, as_it_is, [3, 20], "theta of joint 4 … +90° … lines 5, 22 were not there"),
+                (EXCHANGED, as_it_is, [3, 20], "rows 2 and 3 were exchanged … lines 5, 22 were not there"),
+                # joint 1 is square to joint 2: half a turn of the one's zero is the opposite sign of the other
+                (turned(0, 0, 0, 2, 0, 0), as_it_is, [], "or if"),
+                (mh80(), lambda q: q[:, [0, 2, 1, 3, 4, 5]], [], "columns q2 and q3 were exchanged"),
+                (mh80(), lambda q: q[:, ::-1], [], "opposite order"),
+                (mh80(), lambda q: np.roll(q, 1, axis=0), [], "one row further up"),
+                (mh80(), lambda q: np.roll(q, -1, axis=0), [], "one row further down"),
+                (mh80(), lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by +1"),
+            ],
+            kept=(1, 2, 3, 4, 6),
+        ),
+    ],
+)
+def test_mistakes_are_named(mistaken, change, wrong, named):
+    data = replace(seen(6, 40), rotations=None)
+    positions = np.array(data.positions)
+    positions[wrong] += np.random.default_rng(0).normal(0, 600.0, (len(wrong), 3))
+    refuses(f"E-IDENTIFY-MISFIT … {named}", start, mistaken, replace(data, q=change(data.q), positions=positions))
+
+
+@pytest.mark.parametrize("way", ["exchanged", "sign", "line", "random"])
+def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(way):
+    """Misreadings that no quaternion convention explains are named; what none explains is refused, too."""
+    rng = np.random.default_rng(4)
+    robot = mh80()
+    data = measured(robot, joint_vectors(robot, 30, rng), rng)
+    angles = Rotation.from_matrix(data.rotations).as_euler("xyz")
+    rotations, said = {
+        "exchanged": (Rotation.from_euler("xyz", angles[:, ::-1]), "the first and the third angle were exchanged"),
+        "sign": (Rotation.from_euler("xyz", angles * [1, -1, 1]), "the angle about Y had the other sign"),
+        "line": (Rotation.from_matrix(np.roll(data.rotations, 1, axis=0)), "each orientation were in the line before"),
+        "random": (Rotation.random(30, rng), "check the convention of the angles"),
+    }[way]
+    refuses(f"E-ROBOT-ORIENTATIONS … {said}", start, robot, replace(data, rotations=rotations.as_matrix()))
+    third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
+    start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
+
+
+@pytest.mark.parametrize(
+    ("starts", "named"),
+    [
+        ((), "20 rows, from line 22 to 41, did not repeat the position"),
+        ((12, 27), "the instrument, or the robot's base, had not moved before lines 14, 29 … column station"),
+    ],
+)
+def test_rows_that_repeat_a_position_and_an_instrument_that_moved_far_are_named(starts, named):
+    """An instrument that moved, while the target stays, is mended by column station."""
+    data = replace(seen(2, 40), rotations=None)
+    positions = data.positions.copy()
+    for k, row in enumerate(starts):
+        positions[row:] = Rigid.exp([0.3, -0.2, 1.0 + k, 1500, -900, 400]) @ positions[row:]
+    if not starts:
+        positions[20:] = positions[19]
+    refuses(f"E-IDENTIFY-MISFIT … {named}", start, mh80(), replace(data, positions=positions))
+
+
+def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():
+    rng = np.random.default_rng(1)
+    true = placed(
+        made(mh80(), rng), Rigid.exp([0.1, -0.05, 2.1, 2500, -900, 400]), {"": Rigid.exp([0, 0.1, 0, 220, 60, 150])}
+    )
+    slipped = replace(true, tools={"": Rigid.exp([0.2, 0.1, 0.4, 120, 160, 180])})
+    q = joint_vectors(true, 60, rng)
+    parts = [measured(robot, q[rows], rng) for robot, rows in ((true, slice(30)), (slipped, slice(30, 60)))]
+    positions = np.vstack([part.positions for part in parts])
+    data = Measurements.from_arrays(q, positions)
+    with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
+        identify(mh80(), data, IdentifyOptions(folds=0))

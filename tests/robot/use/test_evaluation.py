@@ -177,8 +177,7 @@ def test_another_arm_is_refused_in_one_line():
 def test_identify_and_verify_read_what_was_written(tmp_path):
     true = arm()
     data = seen(true, 10, 40, poses=True)
-    (tmp_path / "rows.csv").write_text(evaluated_csv(evaluate({"my robot": true}, data)))
-    again = read_measurements(tmp_path / "rows.csv", true)
+    again = read_measurements(written(tmp_path / "rows.csv", evaluated_csv(evaluate({"my robot": true}, data))), true)
     assert again.q == pytest.approx(data.q, abs=1e-10)
     assert again.points() == pytest.approx(data.points(), abs=1e-6)
     assert again.poses().difference(data.poses()) == pytest.approx(np.zeros((40, 6)), abs=1e-6)
