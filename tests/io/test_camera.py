@@ -379,15 +379,12 @@ def test_a_camera_of_a_pair_is_chosen_and_its_essential_matrices_are_no_cameras(
             same_pixels(read_camera(path), wanted)
 
 
-def test_metashapes_p3_and_p4_are_taken(tmp_path):
+def test_metashapes_p3_and_p4_are_taken_and_a_chosen_name_becomes_one_to_write(tmp_path):
     text = METASHAPE.replace("<date>", "<p3>0.85</p3>\n<p4>-0.44</p4>\n<k4>0.02</k4>\n<b2>0.6</b2>\n<date>")
     lens = read(tmp_path, text)
     assert isinstance(lens, ForeignLens)
     k, p = (-0.2, 0.05, 0.01, 0.02), (-0.0005, 0.001)
     same_pixels(lens, metashape(RAYS[:, :2], 910.25, (1.25, 0.6), k, p, (0.85, -0.44)))
-
-
-def test_a_chosen_name_becomes_one_to_write():
     names = {"Cam B (35mm)": "Cam_B_35mm", "2": "cam2", "a.b": "a_b", "": "cam0", "é": "cam0", "_x": "x"}
     assert {name: name_to_write(name) for name in names} == names
 

@@ -201,16 +201,13 @@ def test_what_is_no_camera_is_named(tmp_path, variables, said):
     refuses(said, read_camera, saved(tmp_path / "camera.mat", variables))
 
 
-def test_matlab_files_that_are_cut_and_hdf5_are_named(tmp_path):
+def test_matlab_files_that_are_cut_and_hdf5_are_named_and_the_same_camera_gives_the_same_bytes(tmp_path):
     path = saved(tmp_path / "camera.mat", {"s": STRUCTURE})
     whole = path.read_bytes()
     for cut in (20, 130, 200, 400):
         refuses("E-CAMERA-UNREADABLE", read_camera, written(path, whole[:cut]))
     hdf5 = written(path, b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
     refuses("E-CAMERA-UNREADABLE … '-v7'", read_camera, hdf5)
-
-
-def test_the_same_camera_gives_the_same_bytes():
     first, second = (WRITERS["matlab"](camera_of("OPENCV"), "cam0") for _ in range(2))
     assert first == second
     assert first.startswith(b"MATLAB 5.0 MAT-file, written by stcal")
@@ -254,7 +251,7 @@ def sensor_file(path, names=NAMES, coeffs=None, label="DJI", more=""):
     return written(path, SENSOR.format(label=label, params=names, coeffs=text, more=more))
 
 
-def test_an_adjusted_sensor_with_its_covariance(tmp_path):
+def test_an_adjusted_sensor_with_its_covariance_and_of_several_one_is_chosen(tmp_path):
     found = read_camera(sensor_file(tmp_path / "cameras.xml"))
     assert found.colmap_model == "OPENCV"
     assert found.focal == pytest.approx([3100, 3100])
@@ -269,9 +266,6 @@ def test_an_adjusted_sensor_with_its_covariance(tmp_path):
     assert found.covariance[0, 2] == pytest.approx(0.5 * 2 * 0.3, rel=1e-6)
     prior = camera_prior(found.calibrated(0, 0)).covariance
     assert np.linalg.eigvalsh(prior / np.sqrt(np.outer(np.diag(prior), np.diag(prior)))).min() > 0
-
-
-def test_of_several_sensors_one_is_chosen(tmp_path):
     other = '<sensor id="1" label="thermal" type="frame"><calibration type="frame" class="adjusted">'
     other += '<resolution width="640" height="512"/><f>700</f></calibration></sensor>'
     path = sensor_file(tmp_path / "doc.xml", more=other)
@@ -296,7 +290,7 @@ def test_a_covariance_reads_back(tmp_path, model):
     assert save_camera(tmp_path / "lens.xml", stated, "metashape") == ("σ and correlations of the parameters",)
 
 
-def test_what_has_no_place_is_said(tmp_path):
+def test_what_has_no_place_is_said_and_cameras_before_alignment_are_none(tmp_path):
     camera = camera_of("OPENCV")
     stated = Camera.of(camera, "FULL_OPENCV", np.diag(np.full(12, 1e-4)))
     assert save_camera(tmp_path / "cameras.xml", stated, "metashape-cameras") == ("σ of k4, k5 and k6",)
@@ -305,6 +299,8 @@ def test_what_has_no_place_is_said(tmp_path):
     assert found.covariance is not None
     assert np.diag(found.covariance)[:9] == pytest.approx(1e-4)
     assert (np.sqrt(np.diag(found.covariance))[9:] < 1e-3).all()
+    text = '<document><chunk><sensors><sensor id="0"/></sensors></chunk></document>'
+    refuses("E-CAMERA-NONE", read_camera, written(tmp_path / "cameras.xml", text))
 
 
 @pytest.mark.parametrize(
@@ -319,8 +315,3 @@ def test_what_has_no_place_is_said(tmp_path):
 )
 def test_covariances_that_are_none(tmp_path, names, coeffs, message):
     refuses(message, read_camera, sensor_file(tmp_path / "cameras.xml", names, coeffs))
-
-
-def test_cameras_before_alignment(tmp_path):
-    text = '<document><chunk><sensors><sensor id="0"/></sensors></chunk></document>'
-    refuses("E-CAMERA-NONE", read_camera, written(tmp_path / "cameras.xml", text))

@@ -81,13 +81,10 @@ def test_rounding_of_zero_passes(seed):
     require_covariance(noise, 6, OF_POSE)
 
 
-def test_just_beyond_rounding():
+def test_just_beyond_rounding_and_singular_where_it_is_inverted():
     low, high = (with_entry(0, 1, 1 + share * 6 * ROUNDING) for share in (0.5, 1.5))
     require_covariance(low, 6, OF_POSE)
     refuses("E-COVARIANCE-VALUE … 1", require_covariance, high, 6, OF_POSE)
-
-
-def test_what_is_inverted_must_not_be_singular():
     stack = np.tile(np.diag(SIGMA**2), (5, 1, 1))
     assert first_fault(stack, OF_POSE, definite=True) is None
     stack[2, 5, 5] = stack[4, 5, 5] = 0

@@ -205,7 +205,7 @@ def cahvor_file(path, numbers):
     return read_lens(written(path, text))
 
 
-def test_cahvor_projects_as_mrcal_does(tmp_path):
+def test_cahvor_projects_as_mrcal_does_and_about_the_axis_of_the_image_as_opencv(tmp_path):
     """Numbers of mrcal's own test of projections, test/test-projections.py, px."""
     lens = cahvor_file(tmp_path / "a.cameramodel", CAHVOR)
     assert isinstance(lens, ForeignLens)
@@ -213,18 +213,15 @@ def test_cahvor_projects_as_mrcal_does(tmp_path):
     told = [[2143.17840406, 1442.93419919], [-92.63813066, 1653.09646897], [-249.83199315, -2606.46477164]]
     assert lens.project(rays) == pytest.approx(np.array(told), abs=1e-6)
     refuses("E-CAMERA-COEFFICIENTS … 8 … LENSMODEL_CAHVOR", cahvor_file, tmp_path / "a.cameramodel", CAHVOR[:8])
-
-
-def test_cahvor_about_the_axis_of_the_image_is_opencvs(tmp_path):
     lens = cahvor_file(tmp_path / "a.cameramodel", (*CAHVOR[:4], 0, 0, 0.01, -0.1, 0.02))
     assert isinstance(lens, CameraModel)
     assert lens.focal == pytest.approx([1.01 * CAHVOR[0], 1.01 * CAHVOR[1]])
     assert lens.distortion[:4] == pytest.approx([-0.1 / 1.01, 0.02 / 1.01, 0, 0])
     # … and as the formula goes on when the axis is turned by hardly anything
     near = cahvor_file(tmp_path / "b.cameramodel", (*CAHVOR[:4], 1e-12, 0, 0.01, -0.1, 0.02))
-    rays = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.0]])
+    turned = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.0]])
     assert isinstance(near, ForeignLens)
-    assert near.project(rays) == pytest.approx(lens.sized(4000, 2200).project(rays), abs=1e-6)
+    assert near.project(turned) == pytest.approx(lens.sized(4000, 2200).project(turned), abs=1e-6)
 
 
 def turned_lens(angle_deg, region=None) -> tuple[ForeignLens, Camera, Rigid]:
@@ -279,7 +276,7 @@ def test_a_lens_is_fitted_where_it_was_determined_and_compared_by_its_own_projec
     assert 0.2 < np.nanmax(compare_cameras(fitted, longer).lengths()) < 0.7
 
 
-def test_mrcals_region_is_read(tmp_path):
+def test_mrcals_region_is_read_and_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(tmp_path, recwarn):
     text = (
         "{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
         f"'valid_intrinsics_region': {REGION.tolist()}, 'imagersize': [{WIDTH}, {HEIGHT}]}}"
@@ -288,9 +285,6 @@ def test_mrcals_region_is_read(tmp_path):
     np.testing.assert_array_equal(read_lens(path).region, REGION)
     wrong = written(path, text.replace(str(REGION.tolist()), "[1, 2, 3]"))
     refuses("E-CAMERA-CONTENT … valid_intrinsics_region", read_lens, wrong)
-
-
-def test_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(recwarn):
     lens = ForeignLens("too strong", lambda rays: 1e308 * rays[:, :2] * 10, 10, 10)
     assert not np.isfinite(lens.project(np.ones((2, 3)))).any()
     assert not recwarn.list

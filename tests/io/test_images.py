@@ -59,15 +59,12 @@ def test_whole_files_are_read_and_truncated_ones_refused(suffix):
         refuses(code, decode, other, f"x{suffix}")
 
 
-def test_sixteen_bit_and_colour():
+def test_sixteen_bit_and_colour_are_read_and_exif_orientation_ignored():
     deep = (np.arange(48 * 64, dtype=np.uint16) * 20).reshape(48, 64)
     np.testing.assert_array_equal(decode(encoded(".png", deep), "x"), deep)
     colour = np.dstack([np.full((48, 64), v, np.uint8) for v in (10, 20, 30)])
     # Rec. 601 luma: 0.114·10 + 0.587·20 + 0.299·30 = 21.85.
     assert abs(int(decode(encoded(".png", colour), "x")[0, 0]) - 22) <= 1
-
-
-def test_exif_orientation_is_ignored():
     data = encoded(".jpg")
     # A minimal APP1 segment with orientation 6 (turn by 90°), put behind the start of image.
     exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"

@@ -49,12 +49,15 @@ def test_lengths_of_kalibr_are_metres(tmp_path, size):
     assert "metres" in str(caught.value)
 
 
-def test_layouts_and_places_in_metres_and_a_tag_inside_another(tmp_path):
+def test_layouts_and_places_in_metres_a_tag_inside_another_and_tiny_ones_that_come_back(tmp_path):
     load_layout(written(tmp_path / "file.toml", TAGS.format(60.0, 0.0, 120.0)))
     refuses("E-LENGTH-UNIT … tag 0 … 0.06", load_layout, written(tmp_path / "file.toml", TAGS.format(0.06, 0.0, 0.12)))
     refuses("E-TAG-OVERLAP … 0 … 1 … 0.12", load_layout, written(tmp_path / "file.toml", TAGS.format(60.0, 0.0, 0.12)))
     text = TAGS.format(60.0, 0.0, 0.0).replace("id = 1\nsize_mm = 60.0", "id = 1\nsize_mm = 6.0")
     assert len(load_layout(written(tmp_path / "file.toml", text)).tags) == 2
+    tags = (("DICT_APRILTAG_36h11", 0),)
+    layout = TargetLayout("tiny", tags, 0.5 * UNIT_SQUARE[None], np.eye(8) * 1e-8, 0, unusual_size=True)
+    assert load_layout(written(tmp_path / "file.toml", layout_toml(layout))).corners_mm[0, 1, 0] == pytest.approx(0.25)
 
 
 def test_targets_in_metres(tmp_path):
@@ -68,7 +71,7 @@ def test_targets_in_metres(tmp_path):
     assert load_target(written(tmp_path / "file.toml", target_toml(small))).faces[0].radius_mm[0] == 0.006
 
 
-def test_robots_in_metres_and_one_without_links(tmp_path):
+def test_robots_in_metres_one_without_links_and_urdf_in_millimetres(tmp_path):
     load_robot(written(tmp_path / "file.toml", ROBOT.format(0, -612.0)))
     for wrong in (-0.612, -612000.0):
         refuses(
@@ -78,15 +81,6 @@ def test_robots_in_metres_and_one_without_links(tmp_path):
     rows = (DHRow(0.02, np.pi / 2, 0.0, 0.0), DHRow(0.0, 0.0, 0.01, 0.0))
     robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()}, unusual_size=True)
     assert load_robot(written(tmp_path / "file.toml", robot_toml(robot))).rows[0].a == 0.02
-
-
-def test_a_layout_of_tiny_tags_comes_back(tmp_path):
-    tags = (("DICT_APRILTAG_36h11", 0),)
-    layout = TargetLayout("tiny", tags, 0.5 * UNIT_SQUARE[None], np.eye(8) * 1e-8, 0, unusual_size=True)
-    assert load_layout(written(tmp_path / "file.toml", layout_toml(layout))).corners_mm[0, 1, 0] == pytest.approx(0.25)
-
-
-def test_urdf_in_millimetres(tmp_path):
     text = (
         '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
         '<child link="b"/><origin xyz="{} 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint></robot>'

@@ -121,16 +121,31 @@ def test_what_comments_say_of_units(tmp_path, comment, axis):
     assert next(iter(table(tmp_path, f"{comment}\nX;Y\n1,5;2\n").columns)) == axis
 
 
-def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
+def test_a_unit_that_nothing_states_is_asked_for_and_a_covariance_is_whole_or_there_is_none(tmp_path):
     with fails_with("E-TABLE-COLUMN-MISSING … X … open … x_mm …"):
         table(tmp_path, "Point Name;X;Y;Z\np0;1,5;2,5;3,5\n").quantity("x", LENGTHS)
+    given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_z"]
+    found = table(tmp_path, ",".join(given) + "\n" + ",".join(["1"] * len(given)) + "\n")
+    refuses("E-TABLE-COLUMN-MISSING … tool_cov_ry_z", found.pose_covariances, "tool_")
+    assert found.pose_covariances("other_") is None
 
 
-def test_key_columns_of_two_names(tmp_path):
+def test_key_columns_of_two_names_and_pairs_of_two_files(tmp_path):
     a = written(tmp_path / "a.csv", "image,q1_deg\np2,20\np1,10\n")
     b = written(tmp_path / "b.csv", "Point Name;X [mm]\np1;1,5\np2;2,5\n")
     np.testing.assert_array_equal(join_tables(a, b, "image=Point Name").table.numbers("x_mm"), [2.5, 1.5])
     refuses("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME", join_tables, a, b, "image")
+    a = written(tmp_path / "c.csv", "name,x_mm,y_mm,z_mm\np1,1,2,3\np2,4,5,6\np9,0,0,0\n")
+    b = written(tmp_path / "d.csv", "P;x_m;y_m;z_m\np2;1;1;1\np1;2;2;2\n")
+    pairs = register.read_pairs(a, b, key="name=P")
+    assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
+    assert np.allclose(pairs.xyz_b, [[2000] * 3, [1000] * 3])
+    assert pairs.notes == (f"1 rows of {a} have no partner: name p9",)
+    table = stcal.load_table(b)
+    joined = stcal.join_tables(a, table, "name=P", ("a", "b"))
+    assert np.array_equal(register.read_pairs(joined.table).xyz_b, pairs.xyz_b)
+    both = stcal.stack_tables([table, table], ["first", "second"])
+    assert both.text("set") == ["first", "first", "second", "second"]
 
 
 @pytest.mark.parametrize("units", ["mm", "[mm]", "(mm)", " mm "])
@@ -140,14 +155,7 @@ def test_a_row_of_units_below_the_header(tmp_path, units, separator):
     np.testing.assert_array_equal(table(tmp_path, text).points(), [[1.5, 2, 3], [4, 5, 6]])
 
 
-def test_a_covariance_is_whole_or_there_is_none(tmp_path):
-    given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_z"]
-    found = table(tmp_path, ",".join(given) + "\n" + ",".join(["1"] * len(given)) + "\n")
-    refuses("E-TABLE-COLUMN-MISSING … tool_cov_ry_z", found.pose_covariances, "tool_")
-    assert found.pose_covariances("other_") is None
-
-
-def test_names_that_a_spreadsheet_would_run_are_guarded_and_read_back(tmp_path):
+def test_names_that_a_spreadsheet_would_run_are_guarded_in_the_one_place_that_writes_csv(tmp_path):
     """CWE-1236; figures stay figures."""
     names = ["=1+11/a.jpg", "+a", "-b", "@c", "'=d", "'e", "f"]
     text = csv_text([["image", "=x"], *([name, "-0.5"] for name in names)])
@@ -157,9 +165,6 @@ def test_names_that_a_spreadsheet_would_run_are_guarded_and_read_back(tmp_path):
     with pytest.raises(ValueError, match="field larger"):
         list(csv_rows("image\n" + "1" * 200_000))
     assert list(read_table(table(tmp_path, text), "t").text("image")) == names
-
-
-def test_no_other_place_writes_csv():
     package = Path(stcal.__file__).parent
     found = {path for path in package.rglob("*.py") if "csv.writer(" in path.read_text(encoding="utf-8")}
     assert found == {package / "io" / "table.py"}
@@ -206,11 +211,13 @@ def test_conventions(header, values, rotation, expected):
     assert found.columns == tuple(header.split(","))
 
 
-def test_columns_that_name_their_angles_are_not_overruled_in_silence():
+def test_columns_that_name_their_angles_are_not_overruled_and_half_turns_are_their_own_inverse():
     header = "euler_ZYX_1_deg,euler_ZYX_2_deg,euler_ZYX_3_deg"
     assert np.array_equal(read(header, 3, 2, 1).rotation, read(header, 3, 2, 1, rotation="ZYX-deg").rotation)
     with fails_with("E-OPTION-CONTRADICTS … euler_ZYX_1_deg … --rotation xyz-deg … rename"):
         read(header, 3, 2, 1, rotation="xyz-deg")
+    half = np.repeat(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix()[None], 5, axis=0)
+    np.testing.assert_allclose(INVERTED.rotations(half), half, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -270,11 +277,6 @@ def test_the_reading_that_fits_is_found(wrong):
     assert [held for held in off if off[held] < 1e-9] == [wrong.held]
 
 
-def test_half_turns_are_their_own_inverse():
-    half = np.repeat(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix()[None], 5, axis=0)
-    np.testing.assert_allclose(INVERTED.rotations(half), half, atol=1e-12)
-
-
 A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))
 
 
@@ -311,20 +313,6 @@ def test_rows_of_one_key_stand_side_by_side(tmp_path):
     assert found.table.text("status") == ["ok", "ok"]
     assert "bcov_x_x" in found.table
     assert found.notes == (f"1 rows of {a} have no partner: image p9",)
-
-
-def test_pairs_of_two_files(tmp_path):
-    a = written(tmp_path / "a.csv", "name,x_mm,y_mm,z_mm\np1,1,2,3\np2,4,5,6\np9,0,0,0\n")
-    b = written(tmp_path / "b.csv", "P;x_m;y_m;z_m\np2;1;1;1\np1;2;2;2\n")
-    pairs = register.read_pairs(a, b, key="name=P")
-    assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
-    assert np.allclose(pairs.xyz_b, [[2000] * 3, [1000] * 3])
-    assert pairs.notes == (f"1 rows of {a} have no partner: name p9",)
-    table = stcal.load_table(b)
-    joined = stcal.join_tables(a, table, "name=P", ("a", "b"))
-    assert np.array_equal(register.read_pairs(joined.table).xyz_b, pairs.xyz_b)
-    both = stcal.stack_tables([table, table], ["first", "second"])
-    assert both.text("set") == ["first", "first", "second", "second"]
 
 
 @pytest.mark.parametrize(

@@ -62,14 +62,11 @@ def test_frames_are_sharp_and_apart():
     assert 0.5 * count / PER_VIEW < len(numbers) <= np.ceil(count / PER_VIEW) + 1
 
 
-def test_a_picture_at_rest_is_one_view():
+def test_a_picture_at_rest_is_one_view_and_of_every_so_many_frames_the_sharpest_is_taken():
     still = moving(1)[0]
     rng = np.random.default_rng(1)
     noisy = [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(20)]
     assert len(list(chosen_frames(iter(noisy), AUTO))) == 1
-
-
-def test_of_every_so_many_frames_the_sharpest_is_taken():
     numbers = [frame.number for frame in chosen_frames(iter(moving(20, {0, 2, 3, 4, 7})), 5)]
     assert numbers[0] == 1
     assert [number // 5 for number in numbers] == [0, 1, 2, 3]

@@ -122,29 +122,32 @@ def test_an_id_twice_in_view_and_a_scene_that_moved_are_rejected(located, plain)
     assert result.pose is None
 
 
-def test_images_of_another_size(located, plain):
+def test_images_of_another_size_are_rejected_and_one_wrong_tag_left_out(located, plain, seen):
     reasons = "exposures of different sizes (", "images of 1200×890 px, the camera file is of 1200×900 px"
     for first, reason in zip((plain, plain[:-10]), reasons, strict=True):
         verdict = located([first, plain[:-10]]).verdict
         assert verdict.decision == "reject"
         assert reason in verdict.reasons[0]
         assert "1200×890" in verdict.reasons[0]
+    corners = LAYOUT.corners_mm.copy()
+    corners[1] = np.roll(corners[1], 2, axis=0)
+    result = in_scene(seen, dataclasses.replace(LAYOUT, corners_mm=corners))
+    assert result.pose.outliers == (1,)
+    assert not any("fit if" in reason for reason in result.verdict.reasons)
 
 
-def test_scenes_of_a_folder(tmp_path, plain):
+def test_scenes_of_a_folder_and_a_damaged_exposure_that_is_left_out(tmp_path, plain):
     for name in ("near", "far"):
         (tmp_path / name).mkdir()
         for k in (1, 2):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), plain[:20, :20])
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path)] == [("far", 2), ("near", 2)]
     assert [(scene.name, len(scene.files)) for scene in find_scenes(tmp_path / "far" / "1.png")] == [("1", 1)]
-
-
-def test_a_damaged_exposure_is_left_out_and_named(tmp_path, plain):
     good = cv2.imencode(".png", plain)[1].tobytes()
-    (tmp_path / "a.png").write_bytes(good)
-    (tmp_path / "b.png").write_bytes(good[: len(good) // 2])
-    result = next(iter(run(find_scenes(tmp_path), LAYOUT, MODEL)))
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "a.png").write_bytes(good)
+    (tmp_path / "damaged" / "b.png").write_bytes(good[: len(good) // 2])
+    result = next(iter(run(find_scenes(tmp_path / "damaged"), LAYOUT, MODEL)))
     assert result.verdict.decision == "accept"
     assert result.notes[0].startswith("left out: b.png: truncated")
 
@@ -186,14 +189,6 @@ def test_tags_that_are_turned_in_the_layout(seen, layout, remedy):
     assert remedy in result.verdict.reasons[-1]
 
 
-def test_one_tag_that_is_wrong_is_left_out_and_nothing_is_made_of_it(seen):
-    corners = LAYOUT.corners_mm.copy()
-    corners[1] = np.roll(corners[1], 2, axis=0)
-    result = in_scene(seen, dataclasses.replace(LAYOUT, corners_mm=corners))
-    assert result.pose.outliers == (1,)
-    assert not any("fit if" in reason for reason in result.verdict.reasons)
-
-
 SMALL = Camera(320, 240, [500.0, 500.0], [159.5, 119.5], np.zeros(8))
 TWO = TagLayout.from_tags("4X4_50", [3, 7], [[0.0, 0.0], [50.0, 0.0]], [30.0, 25.0], [0.0, 90.0])
 PLACE = Rigid.exp([0.3, 0.2, 0.1, -25.0, 5.0, 300.0])
@@ -206,16 +201,13 @@ def two_tags():
     return rendered(TWO, place, (320, 240), np.random.default_rng(1))
 
 
-def test_an_array_is_located_whatever_its_colour_and_depth(two_tags):
+def test_an_array_is_located_whatever_its_colour_and_depth_and_false_dictionaries_and_images_are_named(two_tags):
     camera = CameraModel((500, 500), (159.5, 119.5), np.zeros(8), "PINHOLE", 320, 240, "")
     assert_true(locate_image(two_tags, TWO, camera), PLACE)
     plain = locate_image(two_tags, TargetLayout.of(TWO), SMALL).pose
     for image in (np.dstack([two_tags] * 3), two_tags[:, :, None], two_tags.astype(np.uint16) * 257):
         pose = locate_image(image, TWO, SMALL).pose.camera_from_obj
         assert np.linalg.norm(pose.translation - plain.camera_from_obj.translation) < 3 * plain.sigma_mm()
-
-
-def test_a_wrong_dictionary_is_named_and_images_that_are_none_of_the_cameras(two_tags):
     other = TagLayout.from_tags("5X5_50", [1], [[0.0, 0.0]], 30.0)
     result = locate_image(two_tags, other, SMALL)
     assert result.pose is None

@@ -133,7 +133,8 @@ def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
     assert content["identified"]["weighting"]["sigma_mm"] == pytest.approx(0.03, rel=0.3)
 
 
-def test_joint_values_are_needed_for_a_robot_one_of_each_pair(run, tmp_path, robot_pairs):
+def test_joint_values_are_needed_and_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):
+    """Eight points for 27 parameters: the transform is written, and the command says that the rest failed."""
     folder, pairs, _ = robot_pairs
     out = tmp_path / "o.json"
     code, _, err = run(pairs_file(tmp_path, rows_of(*points())), "--robot", folder / "robot.toml", "--out", out)
@@ -150,13 +151,7 @@ def test_joint_values_are_needed_for_a_robot_one_of_each_pair(run, tmp_path, rob
     fewer = Measurements.from_arrays(np.zeros((44, 6)), given.xyz_b[1:])
     said = "E-ARRAY-SHAPE … 45 point pairs … 44 joint vectors"
     refuses(said, workflows.register_with_robot, given, transform, robot, fewer)
-
-
-def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):
-    """Eight points for 27 parameters: the transform is written, and the command says that the rest failed."""
-    folder, pairs, _ = robot_pairs
     head, *rows = pairs.read_text().splitlines()
-    out = tmp_path / "o.json"
     code, _, err = run(pairs_file(tmp_path, rows[:8], head), "--robot", folder / "robot.toml", "--out", out)
     assert code == 3
     assert "27 parameters" in err

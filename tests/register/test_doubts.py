@@ -33,7 +33,7 @@ def test_a_line_is_refused(method):
     refuses("E-POINTS-COLLINEAR", register, a * [1, 0, 0], seen_of(a * [1, 0, 0]), method=method)
 
 
-def test_a_plane_is_solved_rigidly_and_refused_affinely():
+def test_a_plane_is_refused_affinely_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
     a = np.random.default_rng(1).uniform(-100, 100, (25, 3)) * [1, 1, 0]
     found = register(a, seen_of(a), folds=0)
     assert found.inliers.all()
@@ -45,10 +45,6 @@ def test_a_plane_is_solved_rigidly_and_refused_affinely():
     raised = np.vstack([a[:12], [[0, 0, 90]]])
     found = register(raised, seen_of(raised), model="affine", method="least-squares", folds=0)
     assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
-
-
-def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
-    """Any one wrong point off the line fits exactly, and would set the turn about it."""
     a = np.vstack([along_a_line(12, 0.0), [[0, 80, 0]]])
     found = register(a, seen_of(a), folds=0, lines=range(2, 15))
     assert any("only line 14 keeps the points off a line" in note for note in found.notes)
@@ -61,17 +57,6 @@ def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
 
 
 SQUARE = np.array([[100.0, 0, 0], [0, 100, 0], [-100, 0, 0], [0, -100, 0]])
-
-
-def test_a_symmetric_layout_is_told():
-    found = register(SQUARE, seen_of(SQUARE), folds=0)
-    [note] = [n for n in found.notes if "symmetric" in n]
-    assert "maps it onto itself (row" in note
-    # labels exchanged by such a turn fit as well
-    angle, to = symmetry(SQUARE, 0.5)
-    turned = register(SQUARE, seen_of(SQUARE)[to], folds=0)
-    assert turned.inlier_errors.rms_mm < 4 * SIGMA
-    assert np.degrees(angle) == pytest.approx(90, abs=1) or np.degrees(angle) == pytest.approx(180, abs=1)
 
 
 @pytest.mark.parametrize(("model", "width"), [("rigid", 0.4), ("affine", 0.6)])
@@ -133,7 +118,7 @@ def test_another_unit_is_named(factor, unit, method):
             register(a, b, method=method)
 
 
-def test_points_in_metres_are_doubted_and_a_similarity_tells_units():
+def test_points_in_metres_are_doubted_a_similarity_tells_units_and_a_symmetric_layout_is_told():
     s = scene(1, 20)
     found = register(s.xyz_a / 25.4, s.xyz_b, model="similarity", folds=0)
     assert any("the scale is 25.4" in note and "is a in inches" in note for note in found.notes)
@@ -141,6 +126,14 @@ def test_points_in_metres_are_doubted_and_a_similarity_tells_units():
     for factor in (1, 1000):
         notes = register(s.xyz_a / factor, s.xyz_b / factor, folds=0).notes
         assert any("if lengths are metres" in note for note in notes) == (factor == 1000)
+    found = register(SQUARE, seen_of(SQUARE), folds=0)
+    [note] = [n for n in found.notes if "symmetric" in n]
+    assert "maps it onto itself (row" in note
+    # labels exchanged by such a turn fit as well
+    angle, to = symmetry(SQUARE, 0.5)
+    turned = register(SQUARE, seen_of(SQUARE)[to], folds=0)
+    assert turned.inlier_errors.rms_mm < 4 * SIGMA
+    assert np.degrees(angle) == pytest.approx(90, abs=1) or np.degrees(angle) == pytest.approx(180, abs=1)
 
 
 @pytest.mark.parametrize(

@@ -119,13 +119,20 @@ def test_the_yaml_of_ur_calibration(universal, convention):
         assert found.robot.rows[1].theta == pytest.approx(UR5E["upper_arm"][5], abs=1e-12)
 
 
-def test_calibration_conf(universal):
+def test_calibration_conf_and_other_files_of_robots_which_are_to_be_converted(universal, tmp_path):
     """Tools and base of the nominal arm stay; with the nominal lengths in it: `tests/test_python_functions.py`."""
     base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
     robot = universal(CONF, nominal(world_from_base=base, tools={"": tool}), name="calibration.conf").robot
     wanted = [base.matrix() @ by_rows(q) @ tool.matrix() for q in Q]
     np.testing.assert_allclose(world_poses(robot, Q).matrix(), wanted, atol=ROUNDING_MM)
     assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
+    for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
+        path = written(tmp_path / name, yaml_of(UR5E))
+        refuses(f"E-ROBOT-FORM … {name} … robot convert", load_robot, path)
+    robot = universal(yaml_of(UR5E)).robot
+    save_robot(tmp_path / "ur.toml", robot)
+    again, here = (world_poses(each, Q).matrix() for each in (load_robot(tmp_path / "ur.toml"), robot))
+    np.testing.assert_allclose(again, here, atol=ROUNDING_MM)
 
 
 @pytest.mark.parametrize(
@@ -141,16 +148,6 @@ def test_calibration_conf(universal):
 )
 def test_mistakes_in_files_of_universal_robots(universal, text, given, error):
     refuses(error, universal, text, given)
-
-
-def test_other_files_of_robots_are_to_be_converted(tmp_path, universal):
-    for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
-        path = written(tmp_path / name, yaml_of(UR5E))
-        refuses(f"E-ROBOT-FORM … {name} … robot convert", load_robot, path)
-    robot = universal(yaml_of(UR5E)).robot
-    save_robot(tmp_path / "ur.toml", robot)
-    again, here = (world_poses(each, Q).matrix() for each in (load_robot(tmp_path / "ur.toml"), robot))
-    np.testing.assert_allclose(again, here, atol=ROUNDING_MM)
 
 
 TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}

@@ -94,7 +94,7 @@ def swept(cell):
 
 
 @pytest.mark.slow
-def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_told(cell, swept):
+def test_each_model_errs_less_than_the_one_before_and_its_files_are_read_by_the_next_step(cell, swept, tmp_path):
     drawn, axes, same, held = (figures.rms for figures in swept.errors.values())
     assert drawn > 5 * held  # 0.5 mm and 1 mrad, of which base and tool take up a part
     assert axes < drawn / 2
@@ -116,10 +116,6 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_and_moves_are_to
     page = files_of(swept)["report.html"]
     for line in swept.compensated.targets.lines:
         assert f'<th scope="row">{line}</th>' in page
-
-
-@pytest.mark.slow
-def test_files_are_read_by_the_next_step(tmp_path, swept):
     save_folder(tmp_path / "arm", files_of(swept))
     work.require_files_written(tmp_path / "arm", swept)
     steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
@@ -210,16 +206,13 @@ def test_what_is_refused(given, head, rows, options, error):
     refuses(error, given, head, rows, **options)
 
 
-def test_joint_values_by_another_column_are_those_of_the_photographs(tmp_path):
+def test_joint_values_by_another_column_and_a_place_that_cannot_be_filled(tmp_path):
     """A column ``image`` beside the one of ``--key`` means something else."""
     rows = [[f"a/{i}.png", f"other-{i}", *range(6)] for i in range(3)]
     log = write_rows(tmp_path / "log.csv", ["photo", "image", *JOINTS], rows)
     found = work.read_joints(log, "photo", ["a/1.png", "a/2.png"], mh80())
     assert found.text("image") == ["a/0.png", "a/1.png", "a/2.png"]
     assert "photo" not in found
-
-
-def test_a_place_that_cannot_be_filled_and_all_files_or_none(tmp_path):
     for name in ("views/a/1.png", "full/identified.toml", "file.toml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("mine")

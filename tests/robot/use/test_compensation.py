@@ -89,7 +89,8 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     assert np.abs(found.q - flipped)[inside].max() < 0.1
 
 
-def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
+def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones_but_of_poses_of_the_flange(case):
+    """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
     given, bare = targets(None, case.q[:FEW]), replace(case.nominal, tools={"": Rigid()})
     found = compensate(case.real, given, bare)
     assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between .* taken in both", found.notes()[0])
@@ -98,24 +99,11 @@ def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
     np.testing.assert_allclose(found.found.q, both.found.q, atol=1e-9)
     nameless = compensate(case.real, given, replace(case.nominal, tools={"other": Rigid()})).notes()[0]
     assert "is not in the nominal file: that of the identified file is taken in both" in nameless
-
-
-def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
-    """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
-    bare = replace(case.nominal, tools={"": Rigid()})
     flange = forward(bare, case.q)
-    found = compensate(case.real, targets(flange, case.q), bare)
-    assert "nominal file is taken in both (joint values beside the poses say so)" in found.notes()[0]
-    reached = forward(replace(case.real, tools={"": Rigid()}), found.found.q)
+    by_flange = compensate(case.real, targets(flange, case.q), bare)
+    assert "nominal file is taken in both (joint values beside the poses say so)" in by_flange.notes()[0]
+    reached = forward(replace(case.real, tools={"": Rigid()}), by_flange.found.q)
     np.testing.assert_allclose(reached.translation, flange.translation, atol=1e-8)
-
-
-def test_poses_of_which_none_is_reached_are_an_error(case, stcal_robot):
-    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
-    (case.folder / "identified.toml").write_text(robot_toml(case.real))
-    code, _, error = stcal_robot("compensate", case.write(POSE, far), "--robot", case.folder / "identified.toml")
-    assert code == 3
-    assert "none of 1 poses is reached" in error
 
 
 def test_every_tool_by_its_name(case):
@@ -133,7 +121,7 @@ def test_every_tool_by_its_name(case):
     refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.read, ["target", *JOINTS], rows)
 
 
-def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
+def test_what_is_not_reached_keeps_its_row_without_joint_values_and_none_of_all_is_an_error(case, stcal_robot):
     places = case.poses.translation[:FEW].copy()
     places[1] = [5000, 0, 0]
     result = compensate(case.real, targets(Poses(case.poses.rotation[:FEW], places)), case.nominal)
@@ -153,9 +141,15 @@ def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     content = CompensationFile.model_validate(result).content()
     assert content["found"]["status"].count("reached") == FEW - 1
     assert content["joints"][1] is None
+    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
+    (case.folder / "identified.toml").write_text(robot_toml(case.real))
+    code, _, error = stcal_robot("compensate", case.write(POSE, far), "--robot", case.folder / "identified.toml")
+    assert code == 3
+    assert "none of 1 poses is reached" in error
 
 
-def test_limits_of_the_controller_are_respected(case):
+def test_limits_of_the_controller_are_respected_and_a_long_way_near_a_singularity_is_told(case):
+    """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     joints = [Joint("revolute", q - 1e-5, q + 1e-5) for q in case.q[0]]
     tight = replace(case.real, joints=tuple(joints))
     result = compensate(tight, targets(None, case.q[:1]), case.nominal)
@@ -163,6 +157,11 @@ def test_limits_of_the_controller_are_respected(case):
     assert np.abs(result.found.q[0] - case.q[0]).max() <= 1e-5 + 1e-9
     assert 0.1 < result.found.error_mm[0] < result.before_mm[0]
     assert "beyond the limits" in result.notes()[0]
+    q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
+    result = compensate(case.real, targets(None, q), case.nominal)
+    moved = np.degrees(np.abs(result.found.q - q).max())
+    assert moved > 1
+    assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
 
 
 @pytest.mark.parametrize("nominal", sampled([False, True]))
@@ -184,16 +183,7 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
     assert all(re.search(r"\(J4 at -150\.\d+°, limit -150°\)", note) for note in told)
 
 
-def test_a_long_way_near_a_singularity_is_told(case):
-    """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
-    q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
-    result = compensate(case.real, targets(None, q), case.nominal)
-    moved = np.degrees(np.abs(result.found.q - q).max())
-    assert moved > 1
-    assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
-
-
-def test_bad_targets_are_named(case):
+def test_bad_targets_are_named_and_each_row_is_compensated_for_its_payload(case):
     refuses("E-TARGETS-NO-POSES … x_mm", case.read, ["a", "b"], [["1", "2"]])
     refuses("E-TARGETS-NO-ORIENTATION", case.read, POSE[:3], [["1", "2", "3"]])
     refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, targets(None, case.q))
@@ -202,9 +192,6 @@ def test_bad_targets_are_named(case):
     for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
         path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
         refuses(message, read_targets, path, case.real, payload_kg=option)
-
-
-def test_each_row_is_compensated_for_its_payload(case):
     bent = elastic(case.real, np.random.default_rng(4))
     mass, poses = np.tile([0.0, 80.0], 2), case.poses[:4]
     at = zip(case.pose_rows()[:4], case.joint_rows()[:4], mass, strict=True)

@@ -44,13 +44,24 @@ def test_a_joint_without_limits_turns_once(limits, low, high):
     assert high - 1 < q.max() <= high
 
 
-def test_chosen_poses_beat_every_random_set():
+def test_chosen_poses_beat_every_random_set_and_are_the_same_of_the_same_seed():
     result = design(ARM, DesignOptions(count=30, observe="pose", candidates=600, seed=3))
     assert (result.seen, result.parameters) == (30, 30)
     assert len(result.random) == 20
     assert result.chosen.o1 > 1.02 * max(each.o1 for each in result.random)
     assert result.sigma_mm < 0.97 * result.random_sigma_mm
     assert result.exchanges > 0
+    box = (600.0, -700.0, 300.0, 1700.0, 700.0, 1500.0)
+    options = DesignOptions(count=12, candidates=200, seed=5, box=box)
+    first, second = design(ARM, options), design(ARM, options)
+    np.testing.assert_array_equal(first.q, second.q)
+    assert not np.array_equal(first.q, design(ARM, replace(options, seed=6)).q)
+    low, high = ARM.limits().T
+    assert ((first.q >= low) & (first.q <= high)).all()
+    at = forward(ARM, first.q).translation
+    assert (at >= box[:3]).all()
+    assert (at <= box[3:]).all()
+    np.testing.assert_allclose(first.poses.translation, at)
 
 
 def test_identification_states_the_indices_that_the_design_promised():
@@ -99,20 +110,6 @@ def test_predicted_sigma_is_that_of_simulated_identifications():
     spread = np.sqrt(np.mean((predict @ found) ** 2))
     # 200 draws of 27 correlated parameters, and 200 against 300 poses: about 5 %.
     assert spread == pytest.approx(result.sigma_mm, rel=0.15)
-
-
-def test_same_seed_same_poses_within_limits_and_box():
-    box = (600.0, -700.0, 300.0, 1700.0, 700.0, 1500.0)
-    options = DesignOptions(count=12, candidates=200, seed=5, box=box)
-    first, second = design(ARM, options), design(ARM, options)
-    np.testing.assert_array_equal(first.q, second.q)
-    assert not np.array_equal(first.q, design(ARM, replace(options, seed=6)).q)
-    low, high = ARM.limits().T
-    assert ((first.q >= low) & (first.q <= high)).all()
-    at = forward(ARM, first.q).translation
-    assert (at >= box[:3]).all()
-    assert (at <= box[3:]).all()
-    np.testing.assert_allclose(first.poses.translation, at)
 
 
 def test_what_no_pose_shows_is_left_out_and_told_and_mistakes_are_named():

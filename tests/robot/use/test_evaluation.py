@@ -274,7 +274,8 @@ def test_a_missing_pose_is_named_and_left_out_of_all_and_poses_by_name_stand_in_
     refuses("E-VERIFY-COMMANDED … 1 … before … after", verify, read(tmp_path, before + moved, head))
 
 
-def test_too_few_and_other_units_are_named(tmp_path):
+def test_too_few_poses_other_units_and_wrong_poses_are_named(tmp_path):
+    """The first pose is in all distances from it: its error looks like one of all others."""
     refuses("E-VERIFY-FEW … 2 … before", verify, read(tmp_path, lines_of("before")[:2]))
     inches = read(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
     [warning] = verify(inches).warnings()
@@ -283,6 +284,18 @@ def test_too_few_and_other_units_are_named(tmp_path):
     still = [f"before,1,2,3,{i},0,0" for i in range(4)]
     refuses("E-VERIFY-ALIKE", verify, read(tmp_path, still))
     refuses("E-TABLE-COLUMN-MISSING … commanded_x_mm", read, tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm")
+    none = np.zeros((10, 3))
+    far, little = none + [0, 300, 0] * (np.arange(10) == 4)[:, None], none + [0, 5, 0] * (np.arange(10) == 0)[:, None]
+    assert ten_poses(lambda at: at) == ""
+    exchanged = ten_poses(lambda at: at[[0, 1, 6, 3, 4, 5, 2, 7, 8, 9]])
+    assert exchanged == "set after: poses P3, P7: not where commanded, the others are; correct or remove"
+    wrong = ten_poses(lambda at: at + far)
+    assert wrong == "set after: pose P5: not where commanded, the others are; correct or remove"
+    assert ten_poses(lambda at: at + little).startswith("set after: pose P1 (")
+    late = ten_poses(lambda at: np.roll(at, 1, axis=0))
+    assert "check units and the order of the poses" in late
+    assert "check units and the order" in ten_poses(lambda at: 1.1 * at)
+    assert "as if the commanded ones were inches" in ten_poses(lambda at: 25.4 * at)
 
 
 @pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
@@ -334,19 +347,3 @@ def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     exact = ten_of_two_sets(0.0, 0.0)  # no error, and no reduction of it
     assert np.isnan(exact.reduction(1)["mean"])
     json.dumps(VerificationFile.model_validate(exact).content(), allow_nan=False)
-
-
-def test_wrong_poses_are_named():
-    """The first pose is in all distances from it: its error looks like one of all others."""
-    none = np.zeros((10, 3))
-    far, little = none + [0, 300, 0] * (np.arange(10) == 4)[:, None], none + [0, 5, 0] * (np.arange(10) == 0)[:, None]
-    assert ten_poses(lambda at: at) == ""
-    exchanged = ten_poses(lambda at: at[[0, 1, 6, 3, 4, 5, 2, 7, 8, 9]])
-    assert exchanged == "set after: poses P3, P7: not where commanded, the others are; correct or remove"
-    wrong = ten_poses(lambda at: at + far)
-    assert wrong == "set after: pose P5: not where commanded, the others are; correct or remove"
-    assert ten_poses(lambda at: at + little).startswith("set after: pose P1 (")
-    late = ten_poses(lambda at: np.roll(at, 1, axis=0))
-    assert "check units and the order of the poses" in late
-    assert "check units and the order" in ten_poses(lambda at: 1.1 * at)
-    assert "as if the commanded ones were inches" in ten_poses(lambda at: 25.4 * at)
