@@ -13,7 +13,7 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.difference import compare_cameras, fit_lens
 from stcal.io.cameras.foreign_lenses import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_camera, read_lens
-from tests.io.camera_files import project
+from tests.io.camera_files import colmap, project
 from tests.outcome import refuses
 from tests.shared import written
 
@@ -51,8 +51,7 @@ def lens_of(tmp_path, model: str):
 
 @pytest.mark.parametrize("model", COLMAP_FOREIGN)
 def test_colmap_projects_the_same(tmp_path, model):
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=colmap_params(model))
-    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
+    wanted = colmap(model, colmap_params(model), rays())
     np.testing.assert_allclose(project(lens_of(tmp_path, model), rays()), wanted, atol=1e-10)
     assert int(pycolmap.CameraModelId.__members__[model]) == COLMAP_FOREIGN[model][0]
 
@@ -67,7 +66,7 @@ def test_the_camera_of_a_database_is_read(tmp_path, model):
             database.write_camera(camera)
     before = path.read_bytes()
     refuses("E-CAMERA-SEVERAL … 2 cameras, 1 needed … 1, 2 … --name", read_lens, path)
-    wanted = np.array([cameras[1].img_from_cam(ray) for ray in rays()]) - 0.5
+    wanted = colmap(model, params, rays())
     np.testing.assert_allclose(project(read_lens(path, "2"), rays()), wanted, atol=1e-10)
     assert path.read_bytes() == before
 
@@ -115,8 +114,7 @@ def test_kalibrs_lenses_project_by_their_papers(tmp_path):
     )
     omni, sphere = kalibr(tmp_path, "omni", [0.3]), kalibr(tmp_path, "ds", [0.3, 0.0])
     np.testing.assert_allclose(sphere.project(r), omni.project(r), atol=1e-10)
-    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[*focal, *centre + 0.5, 0.6, 1.1])
-    wanted = np.array([camera.img_from_cam(ray) for ray in r]) - 0.5
+    wanted = colmap("EUCM", [*focal, *centre + 0.5, 0.6, 1.1], r)
     np.testing.assert_allclose(kalibr(tmp_path, "eucm", [0.6, 1.1]).project(r), wanted, atol=1e-10)
 
 
@@ -129,8 +127,7 @@ def test_kalibrs_lenses_project_by_their_papers(tmp_path):
     ],
 )
 def test_kalibrs_distortions_are_colmaps(tmp_path, distortion, k, model, params):
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=[400.5, 402.0, 640.5, 478.5, *params])
-    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
+    wanted = colmap(model, [400.5, 402.0, 640.5, 478.5, *params], rays())
     np.testing.assert_allclose(kalibr(tmp_path, "omni", [0.0], distortion, k).project(rays()), wanted, atol=1e-10)
 
 

@@ -16,6 +16,7 @@ RAYS = np.column_stack([np.random.default_rng(8).uniform(-0.5, 0.5, (40, 2)), np
 RATIONAL = [0.41, -2.66, 0.0006, -0.0002, 1.52, 0.29, -2.48, 1.45]
 PLUMB = [-0.0306, 0.0352, -0.00013, -0.00014, -0.012, 0, 0, 0]
 SAMPLES = (911.5, 910.25, 639, 359), [-0.2, 0.05, 0.001, -0.0005, 0.01]
+OPENCV = [1502, 1501, 960, 540, -0.1, 0.02, 0.0001, 0.0002]
 ROS = 610.2, 610.5, 640.3, 401.7
 
 
@@ -28,17 +29,12 @@ def metashape() -> np.ndarray:
     return camera_files.metashape(RAYS[:, :2], 3268.25, (1.5, 0), k, p, (0.85, -0.44), centre)
 
 
-def colmap(model: str, size: tuple[int, int], params: list[float]) -> np.ndarray:
-    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
-    return np.array([camera.img_from_cam(ray) for ray in RAYS]) - 0.5
-
-
 CASES = {
     ("stereo_yml/intrinsics.yml", "1"): lambda: perspective(*SAMPLES),
     ("stereo_yml/intrinsics.yml", "2"): lambda: perspective(*SAMPLES),
     ("metashape_p3p4/cal.xml", ""): metashape,
-    ("name_choice/cameras.txt", "2"): lambda: colmap(
-        "OPENCV", (1920, 1080), [1502, 1501, 960, 540, -0.1, 0.02, 0.0001, 0.0002]
+    ("name_choice/cameras.txt", "2"): lambda: camera_files.colmap(
+        "OPENCV", [1502, 1501, 960, 540, -0.1, 0.02, 0.0001, 0.0002], RAYS, (1920, 1080)
     ),
     ("name_choice/cams.xml", "Cam B (35mm)"): lambda: perspective(
         (8196.7, 8196.7, 3000 + 15.4 - 0.5, 2000 + 16.1 - 0.5), [-0.04, 0.02, 0, 0]

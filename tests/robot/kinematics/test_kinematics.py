@@ -27,6 +27,7 @@ from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import Conditions, DHRow, Elasticity, Joint, Robot, loaded, mh80
 from stcal.robot.simulated import joint_vectors, made
 from tests.outcome import refuses
+from tests.robot.test_descriptions import about, place
 from tests.shared import written
 from tests.support.arms import modified, scara
 
@@ -42,17 +43,6 @@ def any_arm(seed: int, joints: int, convention: str) -> Robot:
     return Robot("any", convention, tuple(rows), tuple(kinds), coupling, base, tools)
 
 
-def matrix(turn_z=0.0, z=0.0, x=0.0, turn_x=0.0, turn_y=0.0) -> dict[str, np.ndarray]:
-    (c, cx, cy), (s, sx, sy) = np.cos([turn_z, turn_x, turn_y]), np.sin([turn_z, turn_x, turn_y])
-    return {
-        "Rz": np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-        "Tz": np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]]),
-        "Tx": np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-        "Rx": np.array([[1, 0, 0, 0], [0, cx, -sx, 0], [0, sx, cx, 0], [0, 0, 0, 1]]),
-        "Ry": np.array([[cy, 0, sy, 0], [0, 1, 0, 0], [-sy, 0, cy, 0], [0, 0, 0, 1]]),
-    }
-
-
 @settings(deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from(["standard", "modified"]))
 def test_forward_is_the_product_of_the_rows(seed, joints, convention):
@@ -64,7 +54,8 @@ def test_forward_is_the_product_of_the_rows(seed, joints, convention):
         for row, joint, value in zip(robot.rows, robot.joints, robot.coupling @ q[k], strict=True):
             sliding = joint.type == "prismatic"
             turn, shift = (0, value) if sliding else (value, 0)
-            part = matrix(row.theta + turn, row.d + shift, row.a, row.alpha, row.beta)
+            part = {"Rz": about("z", row.theta + turn), "Tz": place((0, 0, row.d + shift)), "Tx": place((row.a, 0, 0))}
+            part |= {"Rx": about("x", row.alpha), "Ry": about("y", row.beta)}
             order = ("Rz", "Tz", "Tx", "Rx", "Ry") if convention == "standard" else ("Rx", "Tx", "Ry", "Rz", "Tz")
             for name in order:
                 pose = pose @ part[name]
