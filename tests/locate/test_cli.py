@@ -57,7 +57,7 @@ def test_run_writes_accepted_poses(run, files, tmp_path):
     assert all(check["passed"] for check in scenes["a"]["verdict"]["checks"])
     assert len(scenes["a"]["pose"]["residuals_px"]) == 24
     page = report.read_text()
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 3  # of each image
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 

@@ -341,12 +341,12 @@ def test_truth_states_lens_and_rim_and_impossible_ones_are_refused(optical):
     assert stated.pop("optics") == {"lens": lens, "rim_mm": -0.2}
     assert stated == json.loads(json.dumps(plain))
     assert TruthFile.of(optical, options=RenderOptions(rim_mm=0.3)).content()["optics"] == {"rim_mm": 0.3}
-    refuses("E-SIMULATE-OPTICS … f_number … 0", ThinLens, 0.0, 24.0, 900.0)
-    refuses("E-SIMULATE-OPTICS … 20 mm … 24 mm", ThinLens, 4.0, 24.0, 20.0)
+    refuses("E-SIMULATE-OPTIONS … f_number … 0", ThinLens, 0.0, 24.0, 900.0)
+    refuses("E-SIMULATE-OPTIONS … 20 mm … 24 mm", ThinLens, 4.0, 24.0, 20.0)
     refuses("E-FIELD-TYPE … rim_mm", RenderOptions, rim_mm=float("nan"))
-    refuses("E-SIMULATE-OPTICS … 100 mm … at most 20", check_lens, optical, ThinLens(2.0, 24.0, 100.0))
+    refuses("E-SIMULATE-OPTIONS … 100 mm … at most 20", check_lens, optical, ThinLens(2.0, 24.0, 100.0))
     wide = make_scene(replace(OPTICS, distance_mm=500, groups=(("1", "2"),), fisheye_deg=120.0))
-    refuses("E-SIMULATE-OPTICS … equidistant", check_lens, wide, ThinLens(4.0, 24.0, 500.0))
+    refuses("E-SIMULATE-OPTIONS … equidistant", check_lens, wide, ThinLens(4.0, 24.0, 500.0))
 
 
 RAMP = np.tile(np.linspace(20, 200, 300).astype(np.uint8), (200, 1))
