@@ -77,12 +77,6 @@ def test_files_of_every_kind_and_back(tmp_path, text, board):
         assert load_flat_board(written(tmp_path / "board.toml", board_toml(load_board(path)))) == board
 
 
-def test_opencvs_asymmetric_grid():
-    """Its documented layout: x = (2 j + i mod 2) · spacing, y = i · spacing."""
-    xy = CIRCLES.xy_mm()
-    assert np.allclose(xy[[0, 1, 4, 5, 8, 43]], [[0, 0], [40, 0], [20, 20], [60, 20], [0, 40], [120, 200]])
-
-
 ALONE = (
     ('type = "checker"\n', "type 'checker'; one of circles, chessboard"),
     ('type = "chessboard"\nrows = 5\ncolumns = 8\n', "square_mm: key missing"),
@@ -211,7 +205,7 @@ def test_reference_target_round_trip(tmp_path):
         np.testing.assert_allclose(*poses, atol=2 * ROUNDED_MM)
 
 
-def test_the_reference_has_the_published_layout_and_boards_have_arrays():
+def test_the_reference_and_opencvs_grid_have_the_published_layout_and_boards_have_arrays():
     # Zhang & Wei 2017, fig. 1: five faces, each of seven big (r = 8 mm) and three small (r = 4 mm) circles.
     target = reference_target()
     assert len(target.faces) == 5
@@ -225,6 +219,8 @@ def test_the_reference_has_the_published_layout_and_boards_have_arrays():
     np.testing.assert_array_equal(board.xy_mm(), [[0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [20, 10]])
     assert board.labels() == ["board:0:0", "board:0:1", "board:0:2", "board:1:0", "board:1:1", "board:1:2"]
     assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
+    xy = CIRCLES.xy_mm()
+    assert np.allclose(xy[[0, 1, 4, 5, 8, 43]], [[0, 0], [40, 0], [20, 20], [60, 20], [0, 40], [120, 200]])
 
 
 def test_comments_are_right_once_uncommented(tmp_path):
@@ -280,7 +276,7 @@ def test_whole_numbers_are_ids_small_likenesses_are_taken_and_no_negative_zero_i
     assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 
-def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
+def test_a_frame_just_inside_the_smallest_angle_is_taken_and_a_rough_pose_wherever_its_origin_is(tmp_path):
     def bent(sine):
         # Origin at (100, 50): the angle is at the origin circle, wherever it was drawn.
         xy = np.array([[0, 0], [40, 0], [80 * np.sqrt(1 - sine**2), 80 * sine], [40, 40]]) + np.array([100, 50])
@@ -290,9 +286,6 @@ def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
     # y of the third circle is 80 mm times the sine
     assert target_of(tmp_path, bent(1.01 * MIN_SINE)).faces[0].xy_mm[2, 1] == pytest.approx(80.8 * MIN_SINE, abs=1e-8)
     refuses("E-TARGET-FRAME", lambda: target_of(tmp_path, bent(0.99 * MIN_SINE)))
-
-
-def test_a_rough_pose_is_of_the_drawing_wherever_its_origin_is(tmp_path):
     # The drawing's X points along -y and its normal along +x, so its Y along -z; drawn from a corner at (-100, -50).
     moved = SQUARE.replace("x_mm = 0", "x_mm = 100").replace("x_mm = 40", "x_mm = 140")
     moved = moved.replace("y_mm = 0", "y_mm = 50").replace("y_mm = 40", "y_mm = 90")

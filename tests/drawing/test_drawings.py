@@ -232,13 +232,17 @@ def test_svg_has_the_target_in_mm_of_a_design_as_of_its_file(files):
 
 
 @pytest.mark.slow
-def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
+def test_pages_of_a_pdf_have_the_size_of_the_paper_and_a_net_is_on_one_sheet(files, target, tmp_path):
     drawn = draw(files / "target.toml", files / "target.pdf", "letter")
     sizes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", drawn.path.read_bytes())
     assert len(sizes) == len(drawn.sheets) == 5
     for sheet, size in zip(drawn.sheets, sizes, strict=True):
         np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
         assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
+    drawn = draw(target, tmp_path / "net.pdf", net=True)
+    assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
+    refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
+    assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))
 
 
 def test_sheets_cover_the_board_and_seams_run_between_dots():
@@ -336,7 +340,8 @@ def places_of(target, part) -> dict[str, np.ndarray]:
     return found
 
 
-def test_a_box_is_one_net(target):
+def test_a_box_is_one_net_whose_plates_meet_as_they_do_in_space_and_are_read_from_it(target):
+    """At a fold both plates have the same corners."""
     part = net_part(target)
     assert set(circles_of(part)) == set(target.radius_of())
     plates = places_of(target, part)
@@ -351,27 +356,6 @@ def test_a_box_is_one_net(target):
         assert all(end.any() for end in ends)
     lengths = sorted(float(np.linalg.norm(np.diff(line.lines[0], axis=0))) for line in folds)
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_net_is_on_one_sheet(target, tmp_path):
-    """400 × 200 mm and more."""
-    drawn = draw(target, tmp_path / "net.pdf", net=True)
-    assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
-    refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
-    assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))
-
-
-@pytest.mark.parametrize(("width_mm", "paper"), [(30.0, "A4"), (90.0, "A2")])
-def test_a_dodecahedron_is_one_net(width_mm, paper):
-    body = tag_body("dodecahedron", width_mm, "DICT_APRILTAG_36h11", 0)
-    assert net_text(body).endswith(f"one sheet of {paper}")
-
-
-def test_plates_meet_in_the_net_as_they_do_in_space_and_all_faces_are_read_from_it(target):
-    """Folded circles' distances across an edge: at a fold both plates have the same corners."""
-    part = net_part(target)
-    plates = places_of(target, part)
     space = {f.id: f.rough_target_from_face @ np.pad(f.outline_mm, ((0, 0), (0, 1))) for f in target.faces}
     together = 0
     for one, other in combinations(plates, 2):
@@ -385,6 +369,12 @@ def test_plates_meet_in_the_net_as_they_do_in_space_and_all_faces_are_read_from_
     found = detect_image(image, camera_of(image), target, None, EllipseOptions())
     assert sorted(each.face for each in found.faces) == sorted(face.id for face in target.faces)
     assert all(len(each.circles) == 9 for each in found.faces)
+
+
+@pytest.mark.parametrize(("width_mm", "paper"), [(30.0, "A4"), (90.0, "A2")])
+def test_a_dodecahedron_is_one_net(width_mm, paper):
+    body = tag_body("dodecahedron", width_mm, "DICT_APRILTAG_36h11", 0)
+    assert net_text(body).endswith(f"one sheet of {paper}")
 
 
 def test_plates_that_run_the_same_way_do_not_share_an_edge_and_what_lacks_an_outline_is_refused(target, tmp_path):

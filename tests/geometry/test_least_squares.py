@@ -26,16 +26,13 @@ def rosenbrock(x: np.ndarray) -> NormalEquations:
     return NormalEquations.of(residual, np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]))
 
 
-def test_a_curved_valley_is_followed_to_its_end_and_what_nothing_determines_stays():
+def test_a_curved_valley_is_followed_to_its_end_also_by_many_problems_at_once():
     found = minimise(np.array([-1.2, 1.0]), rosenbrock, np.add)
     assert found.converged
     assert found.state == pytest.approx([1, 1], abs=1e-6)
     assert 5 < found.steps < 100
     found = minimise(np.array([5.0, 7.0]), lambda x: NormalEquations.of(x[:1] - 2, np.array([[1.0, 0.0]])), np.add)
     assert found.state == pytest.approx([2, 7], abs=1e-6)
-
-
-def test_many_problems_end_where_each_would_alone():
     starts = np.array([[-1.2, 1.0], [2.0, 2.0], [0.0, 0.0]])
 
     def at_once(x):

@@ -55,7 +55,7 @@ def view(pose: Rigid, xy: np.ndarray) -> np.ndarray:
 
 
 @given(poses)
-def test_fit_plane_finds_the_plane(pose):
+def test_fit_plane_finds_the_plane_and_the_jacobian_of_a_homography_is_the_derivative(pose):
     xyz = pose @ on_plane(GRID)
     normal = pose.rotation[:, 2]
     for side in (1, -1):
@@ -64,6 +64,15 @@ def test_fit_plane_finds_the_plane(pose):
         assert plane.offset == pytest.approx(side * normal @ pose.translation, abs=1e-9)  # lengths of 1e3 mm
         assert plane.rms < 1e-10
         np.testing.assert_allclose((xyz + 3 * normal) @ plane.normal - plane.offset, side * 3, atol=1e-9)
+    h = np.column_stack([pose.rotation[:, :2], pose.translation])
+    step = 1e-3
+    jac = homography_jacobian(h, GRID)
+    for axis in range(2):
+        d = np.zeros(2)
+        d[axis] = step
+        numeric = (apply_homography(h, GRID + d) - apply_homography(h, GRID - d)) / (2 * step)
+        # Entries are about 1/z = 1e-3; central differences err by rounding, 1e-16 / 1e-3.
+        np.testing.assert_allclose(jac[:, :, axis], numeric, atol=1e-11)
 
 
 def test_plane_rms_is_the_spread_about_it_and_the_offset_that_of_the_field_notes():
@@ -92,7 +101,7 @@ def test_homography_comes_back_from_its_points(pose, n):
     assert np.linalg.norm(found) == pytest.approx(1, rel=1e-12)
 
 
-def test_homographies_side_by_side_are_those_of_single_ones():
+def test_homographies_side_by_side_are_those_of_single_ones_and_of_opencv():
     """Of points with noise, of which each set uses others; and one set that determines none."""
     rng = np.random.default_rng(4)
     used = rng.random((6, len(GRID))) < 0.6
@@ -108,9 +117,6 @@ def test_homographies_side_by_side_are_those_of_single_ones():
         np.testing.assert_allclose(mapped[k], apply_homography(alone, GRID), rtol=1e-9)
         np.testing.assert_allclose(jacobian[k], homography_jacobian(alone, GRID), rtol=1e-9)
     assert np.isnan(together[5]).all()
-
-
-def test_homography_of_noisy_points_agrees_with_opencv():
     rng = np.random.default_rng(3)
     xy_a = view(Rigid.exp([0.4, -0.3, 0.2, -50, -30, 800]), GRID) * 4000 + rng.normal(0, 0.3, GRID.shape)
     ours = apply_homography(fit_homography(GRID, xy_a), GRID)
@@ -119,19 +125,6 @@ def test_homography_of_noisy_points_agrees_with_opencv():
     assert 0 < np.abs(ours - opencv).max() < 0.02
     rms = np.sqrt(((ours - xy_a) ** 2).mean())
     assert rms == pytest.approx(0.3 * np.sqrt(1 - 8 / 40), rel=0.3)  # 40 equations, 8 unknowns, 12 % standard error
-
-
-@given(poses)
-def test_homography_jacobian_is_the_derivative(pose):
-    h = np.column_stack([pose.rotation[:, :2], pose.translation])
-    step = 1e-3
-    jac = homography_jacobian(h, GRID)
-    for axis in range(2):
-        d = np.zeros(2)
-        d[axis] = step
-        numeric = (apply_homography(h, GRID + d) - apply_homography(h, GRID - d)) / (2 * step)
-        # Entries are about 1/z = 1e-3; central differences err by rounding, 1e-16 / 1e-3.
-        np.testing.assert_allclose(jac[:, :, axis], numeric, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -364,14 +357,28 @@ def test_a_near_plane_has_one_and_a_descent_that_does_not_settle_raises():
     refuses("E-NO-MINIMUM", two_minima, lambda _: unsettled, Poses.of([tilted(0.1, 500.0)]), MIDDLE, "no pose at all")
 
 
-def test_minima_are_told_apart_by_the_residuals_own_sigma():
-    """Residuals ten times what is stated: what is two by the stated σ is one by what the residuals say."""
+def test_minima_are_told_apart_by_the_residuals_own_sigma_and_by_what_is_common():
+    """Residuals ten times what is stated: what is two by the stated σ is one by what the residuals say. A shift that
+    all points share weighs nothing once it is in their covariance: χ² is of what is left of 2n − 6."""
     normal = np.diag([1e6] * 3 + [1.0] * 3)
     poses = Poses.of([Rigid.exp([0, 0, 0, 0, 0, 500.0]), Rigid.exp([0.005, 0, 0, 0, 0, 500.0])])  # 5 σ
     assert distinct(poses, normal)
     assert not distinct(poses, normal, robust_sigma=10.0)
     limit = minima(tilted(0.44, 2000.0), tilted(0.44, 2000.0), factor=10.0)[1]
     assert 5 * OUTLIER < limit < 20 * OUTLIER
+    truth = tilted(0.44, 400.0)
+    shifted = measured(truth) + 50 * SIGMA
+    n = len(DOTS)
+    common = np.tile(np.eye(2), (n, 1))
+    covariance = SIGMA**2 * (np.eye(2 * n) + 2500 * common @ common.T)
+    poses = Poses.of([truth])
+    for _ in range(4):
+        xy, by_pose, _ = seen(poses, DOTS, 1.0)
+        found = weigh(shifted - xy, by_pose, covariance[None], poses)
+        step, poses = found.poses.difference(poses)[0], found.poses
+    assert step @ found.normal[0] @ step < 1e-12
+    assert 5 < found.chi2[0] < 45  # χ² of 18: once in 2000 on either side
+    assert found.residual.shape == (1, n, 2)
 
 
 def test_mirrored_twice_is_where_it_was_and_odds_decide():
@@ -386,20 +393,3 @@ def test_mirrored_twice_is_where_it_was_and_odds_decide():
     assert covariance_of_both(np.eye(6), away, np.inf) == pytest.approx(np.eye(6))
     assert deciding_delta(1e-6, 1.0, 0.5) == pytest.approx(27.63, abs=0.01)
     assert deciding_delta(1e-6, 1.5, 4.0) == pytest.approx(4 * 27.63, abs=0.01)
-
-
-def test_weighed_by_what_is_common():
-    """A shift that all points share weighs nothing once it is in their covariance: χ² is of what is left of 2n − 6."""
-    truth = tilted(0.44, 400.0)
-    shifted = measured(truth) + 50 * SIGMA
-    n = len(DOTS)
-    common = np.tile(np.eye(2), (n, 1))
-    covariance = SIGMA**2 * (np.eye(2 * n) + 2500 * common @ common.T)
-    poses = Poses.of([truth])
-    for _ in range(4):
-        xy, by_pose, _ = seen(poses, DOTS, 1.0)
-        found = weigh(shifted - xy, by_pose, covariance[None], poses)
-        step, poses = found.poses.difference(poses)[0], found.poses
-    assert step @ found.normal[0] @ step < 1e-12
-    assert 5 < found.chi2[0] < 45  # χ² of 18: once in 2000 on either side
-    assert found.residual.shape == (1, n, 2)

@@ -73,7 +73,7 @@ def test_matrix_round_trip(a_from_b):
         assert_same(Rigid.from_matrix(matrix), a_from_b)
 
 
-def test_quarter_turn_about_z_by_hand_and_fields_are_read_only_copies():
+def test_quarter_turn_by_hand_fields_are_read_only_copies_and_affine_transforms_invert():
     a_from_b = Rigid.exp([0, 0, np.pi / 2, 10, 20, 30])
     np.testing.assert_allclose(a_from_b @ [1.0, 0, 0], [10, 21, 30], atol=1e-14)
     np.testing.assert_allclose(a_from_b.inverse() @ [10, 21, 30], [1, 0, 0], atol=1e-14)
@@ -87,6 +87,13 @@ def test_quarter_turn_about_z_by_hand_and_fields_are_read_only_copies():
         a_from_b.translation[0] = 1
     with pytest.raises(AttributeError):
         a_from_b.translation = np.ones(3)
+    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
+    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
+    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
+    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
+    refuses("E-AFFINE-SINGULAR", Affine(np.ones((3, 3)), np.zeros(3)).inverse)
 
 
 @given(vectors, vectors)
@@ -157,7 +164,7 @@ def drawn(pose: UncertainRigid, count: int, rng) -> Poses:
     return Poses.of([pose.rigid] * count).moved(rng.multivariate_normal(np.zeros(6), pose.covariance, count))
 
 
-def test_the_covariance_of_a_product_is_that_of_drawn_products():
+def test_the_covariance_of_a_product_is_that_of_drawn_products_and_exact_poses_stay_exact():
     rng = np.random.default_rng(1)
     parts = []
     for _ in range(3):
@@ -175,9 +182,6 @@ def test_the_covariance_of_a_product_is_that_of_drawn_products():
     # σ of a variance from n draws is √(2/n): 1 %; the largest of 21 stays below five of them.
     assert np.abs((seen - chain.covariance) / scale).max() < 0.05
     assert np.abs((np.diag(seen) / np.diag(chain.covariance)) - 1).max() < 0.05
-
-
-def test_a_difference_is_the_motion_in_frame_a_and_exact_poses_stay_exact():
     step, pose = np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]), Rigid.exp([0.4, 0.5, -0.6, 7, 8, 9])
     moved = Rigid(Rigid.exp([*step[:3], 0, 0, 0]).rotation @ pose.rotation, pose.translation + step[3:])
     np.testing.assert_allclose(moved.difference(pose), step, atol=1e-12)
@@ -264,13 +268,3 @@ OFF_ZERO = LINE + np.array([1000.0, 0, 0])  # a line that misses the origin
 )
 def test_degenerate(align, xyz_a, xyz_b, weights, message):
     refuses(message, align, xyz_a, xyz_b, weights)
-
-
-def test_affine_transforms_compose_and_invert():
-    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
-    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
-    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
-    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
-    refuses("E-AFFINE-SINGULAR", Affine(np.ones((3, 3)), np.zeros(3)).inverse)

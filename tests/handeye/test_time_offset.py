@@ -58,10 +58,20 @@ def test_a_robot_that_stands_still_is_said(samples):
     refuses("E-TIME-OFFSET-STANDSTILL", estimate_offset, truth.pairs[alone], truth.stream, truth.seconds[alone])
 
 
-def test_what_does_not_do_is_said():
+def test_what_does_not_do_and_noise_of_samples_are_told_and_there_may_be_more_images_than_samples():
     truth = simulated_stream(np.random.default_rng(5), 8)
     refuses("E-TIME-OFFSET-FEW … 3 … 4", estimate_offset, truth.pairs[:3], truth.stream, truth.seconds[:3])
     refuses("E-TIME-OFFSET-RANGE … 0 … 8 … 67%", estimate_offset, truth.pairs, truth.stream, truth.seconds + 100)
+    turn, shift = stream(noise=(1e-4, 0.05)).rest()
+    assert [turn, shift] == pytest.approx([np.sqrt(3) * 1e-4, np.sqrt(3) * 0.05], rel=0.2)
+    times = np.arange(5) * 0.1
+    samples = swing(times, PHASE)
+    places = tuple(f"line {k + 2}" for k in range(5))
+    robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
+    seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
+    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
+    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
+    assert np.abs(at.poses.difference(swing(seconds, PHASE))).max() < 0.01
 
 
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
@@ -152,20 +162,6 @@ def test_a_cubic_meets_the_swing_by_samples_in_any_order_and_at_both_ends():
     found = Stream.of(times, swing(EVERY[order], PHASE), "robot.csv")
     ends = np.array([0.0, 0.02, 9.94, 9.95])
     assert np.abs(found.at(ends).difference(swing(ends, PHASE))).max() < 1e-4
-
-
-def test_noise_of_samples_is_told_and_there_may_be_more_images_than_samples():
-    """196 samples that miss the cubic through their neighbours: σ to 5 %; lengths of three numbers, √3 σ."""
-    turn, shift = stream(noise=(1e-4, 0.05)).rest()
-    assert [turn, shift] == pytest.approx([np.sqrt(3) * 1e-4, np.sqrt(3) * 0.05], rel=0.2)
-    times = np.arange(5) * 0.1
-    samples = swing(times, PHASE)
-    places = tuple(f"line {k + 2}" for k in range(5))
-    robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
-    seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
-    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
-    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
-    assert np.abs(at.poses.difference(swing(seconds, PHASE))).max() < 0.01
 
 
 def test_what_is_taken_is_said():

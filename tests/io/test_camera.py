@@ -140,13 +140,18 @@ def test_the_smallest_colmap_model_that_holds_it(tmp_path, distortion, expected)
     assert read(tmp_path, yaml_text(d=distortion)).colmap_model == expected
 
 
-def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):
+def test_a_size_that_is_not_stated_is_the_images_and_lists_that_are_no_coefficients_pass(tmp_path):
     model = read(tmp_path, yaml_text())
     assert (model.width, model.height) == (None, None)
     camera = model.sized(640, 480)
     assert (camera.width, camera.height) == (640, 480)
     stated = read(tmp_path, yaml_text(more="image_width: 1000\nimage_height: 800.0\n")).sized(640, 480)
     assert (stated.width, stated.height) == (1000, 800)
+    for other in ("turn: [0.5, 0.5, 0.5, 0.5]", "window: [0, 0, 1280, 720]", "tvec: [0.1, 2, 3, 4.5]"):
+        same_pixels(read(tmp_path, f"camera_matrix: {FLAT}\ndist: {D5}\n{other}\n"), perspective(D5))
+        same_pixels(read(tmp_path, f"camera_matrix: {FLAT}\n{other}\n"), perspective([0.0] * 5))
+    inverse = OST.format(model="distortion_model: inverse_brown_conrady", values=[0.0] * 5)
+    same_pixels(read(tmp_path, inverse), perspective([0.0] * 4))
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -347,14 +352,6 @@ def test_what_is_not_understood_names_the_programs_that_are_read(tmp_path):
     for content in ("hello", f"fx: {FLAT}\n", b"PK\x03\x04\xff", b"\x80\x04\x95\x10\xff"):
         with pytest.raises(InputError, match=programs):
             read(tmp_path, content)
-
-
-def test_lists_that_are_no_coefficients_pass_and_an_inverse_model_of_zeros_has_no_distortion(tmp_path):
-    for other in ("turn: [0.5, 0.5, 0.5, 0.5]", "window: [0, 0, 1280, 720]", "tvec: [0.1, 2, 3, 4.5]"):
-        same_pixels(read(tmp_path, f"camera_matrix: {FLAT}\ndist: {D5}\n{other}\n"), perspective(D5))
-        same_pixels(read(tmp_path, f"camera_matrix: {FLAT}\n{other}\n"), perspective([0.0] * 5))
-    inverse = OST.format(model="distortion_model: inverse_brown_conrady", values=[0.0] * 5)
-    same_pixels(read(tmp_path, inverse), perspective([0.0] * 4))
 
 
 @pytest.mark.parametrize(("more", "named"), [("", "equidistant"), ("42: 7\n", "42")])

@@ -63,10 +63,15 @@ def test_what_is_written_reads_back(tmp_path, form, model):
     np.testing.assert_allclose(found.parameters(), camera.parameters(), rtol=1e-14, atol=1e-12)
 
 
-def test_a_comment_does_not_tell_the_form_and_the_command_knows_every_one(tmp_path):
+def test_a_comment_does_not_tell_the_form_and_metashapes_fisheye_has_its_own_formula(tmp_path):
     assert get_args(Form) == tuple(WRITERS)
     text = "# as the lensmodel of mrcal\n1 PINHOLE 1280 961 812.25 809.5 640.125 478.0625\n"
     assert read_camera(written(tmp_path / "cameras.txt", text)).colmap_model == "PINHOLE"
+    lens, rays = read_lens(written(tmp_path / "c.xml", METASHAPE.replace("frame", "fisheye"))), camera_files.RAYS
+    radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
+    turned = rays[:, :2] * np.arctan(radius) / radius
+    wanted = metashape(turned, 910.25, (1.25, 0), (-0.2, 0.05, 0.01), (-0.0005, 0.001))
+    np.testing.assert_allclose(camera_files.project(lens), wanted, atol=1e-9)
 
 
 @pytest.mark.parametrize(("form", "suffix"), [("colmap", "txt"), ("colmap-bin", "bin")])
@@ -78,15 +83,6 @@ def test_colmap_reads_what_is_written(tmp_path, form, suffix):
         (found,) = pycolmap.Reconstruction(tmp_path).cameras.values()
         assert found.model.name == model
         assert list(found.params) == camera_of(model).colmap_params()
-
-
-def test_metashapes_fisheye_projects_by_its_own_formula(tmp_path):
-    """u = w/2 + cx + x' (f + b1), p1 beside r² + 2 x²; the first pixel is at 0.5."""
-    lens, rays = read_lens(written(tmp_path / "c.xml", METASHAPE.replace("frame", "fisheye"))), camera_files.RAYS
-    radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
-    turned = rays[:, :2] * np.arctan(radius) / radius
-    wanted = metashape(turned, 910.25, (1.25, 0), (-0.2, 0.05, 0.01), (-0.0005, 0.001))
-    np.testing.assert_allclose(camera_files.project(lens), wanted, atol=1e-9)
 
 
 STRUCTURE = {

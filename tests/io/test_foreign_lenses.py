@@ -71,7 +71,8 @@ def test_the_camera_of_a_database_is_read(tmp_path, model):
     assert path.read_bytes() == before
 
 
-def test_a_database_of_something_else_is_refused(tmp_path):
+def test_a_database_of_something_else_is_refused_and_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
+    """A double sphere of 220°: the image reaches beyond what a model here sees."""
     path = tmp_path / "other.db"
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
@@ -82,6 +83,10 @@ def test_a_database_of_something_else_is_refused(tmp_path):
     with sqlite3.connect(path) as database:
         database.execute("DROP TABLE cameras")
     refuses("E-CAMERA-UNREADABLE … no such table: cameras", read_lens, path)
+    text = KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", [])
+    assert fit_lens(read_lens(written(tmp_path / "chain.yaml", text)), WIDTH, HEIGHT).share < 0.5
+    lens_of(tmp_path, "FOV")  # and other commands ask for the conversion
+    refuses("E-CAMERA-MODEL … COLMAP's FOV", read_camera, tmp_path / "cameras.txt")
 
 
 @pytest.mark.parametrize("count", [12, 14])
@@ -170,14 +175,6 @@ def test_a_fit_is_off_by_no_more_than_it_says(tmp_path, model, most_px):
     assert found.share == 1
 
 
-def test_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
-    """A double sphere of 220°: the image reaches beyond what a model here sees."""
-    text = KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", [])
-    assert fit_lens(read_lens(written(tmp_path / "chain.yaml", text)), WIDTH, HEIGHT).share < 0.5
-    lens_of(tmp_path, "FOV")  # and other commands ask for the conversion
-    refuses("E-CAMERA-MODEL … COLMAP's FOV", read_camera, tmp_path / "cameras.txt")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -239,7 +236,8 @@ def inside(polygon: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_fit_turns_the_camera_where_that_helps():
+def test_a_fit_turns_the_camera_where_the_lens_was_determined_which_is_compared_by_its_own_projection():
+    """Not by the model that is fitted to it, which is a pixel off."""
     lens, camera, turn = turned_lens([2.0, -3.0, 1.0])
     found = fit_lens(lens, WIDTH, HEIGHT)
     assert found.rms_px < 1e-3
@@ -247,14 +245,6 @@ def test_a_fit_turns_the_camera_where_that_helps():
     np.testing.assert_allclose(found.camera.centre, camera.centre, atol=0.1)
     straight = fit_lens(ForeignLens("", camera.project, WIDTH, HEIGHT), WIDTH, HEIGHT)
     assert straight.camera_from_lens.angle_rad() == 0
-
-
-REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
-
-
-@pytest.mark.slow
-def test_a_lens_is_fitted_where_it_was_determined_and_compared_by_its_own_projection():
-    """Not by the model that is fitted to it, which is a pixel off."""
     lens, camera, turn = turned_lens([1.0, 2.0, 0.0], REGION)  # beyond the region it is 3000 px off
     pixels = np.random.default_rng(0).uniform([0, 0], [WIDTH, HEIGHT], (500, 2))
     np.testing.assert_array_equal(lens.determined(pixels), inside(REGION, pixels))
@@ -271,6 +261,9 @@ def test_a_lens_is_fitted_where_it_was_determined_and_compared_by_its_own_projec
     longer = Camera(WIDTH, HEIGHT, camera.focal * 1.001, camera.centre, camera.distortion)
     # a thousandth of the way from the middle, of which a turn and the offset of the region take a part
     assert 0.2 < np.nanmax(compare_cameras(fitted, longer).lengths()) < 0.7
+
+
+REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
 
 
 def test_mrcals_region_is_read_and_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(tmp_path, recwarn):

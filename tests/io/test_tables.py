@@ -302,7 +302,7 @@ def test_a_line_of_another_form_is_named():
     refuses("E-MODEL-UNREADABLE … line 3", image_lines, f"{A}\nno image\n", "images.txt")
 
 
-def test_rows_of_one_key_stand_side_by_side(tmp_path):
+def test_rows_of_one_key_stand_side_by_side_and_names_that_are_numbers_as_they_are_written(tmp_path):
     a = written(tmp_path / "poses.csv", "image,x_mm,y_mm,z_mm,status\np1,1,2,3,ok\np2,4,5,6,ok\np9,0,0,0,ok\n")
     b = written(tmp_path / "tracker.csv", "image,x_m,y_m,z_m,cov_x_x,status\np2,0.4,0.5,0.6,1,?\np1,0.1,0.2,0.3,1,?\n")
     found = join_tables(a, b, "image", ("a", "b"))
@@ -313,6 +313,14 @@ def test_rows_of_one_key_stand_side_by_side(tmp_path):
     assert found.table.text("status") == ["ok", "ok"]
     assert "bcov_x_x" in found.table
     assert found.notes == (f"1 rows of {a} have no partner: image p9",)
+    stamps = "1700000000123456789", "1700000000223456789"
+    a = written(tmp_path / "c.csv", f"image,time_ns,x_mm\n0001,{stamps[0]},1.50\n0002,{stamps[1]},2.50\n")
+    b = written(tmp_path / "d.csv", "image,u_px\n0002,7\n0001,8\n")
+    joined = join_tables(a, b, "image").table
+    assert (joined.text("image"), joined.text("time_ns")) == (["0001", "0002"], list(stamps))
+    assert np.array_equal(joined.numbers("x_mm"), [1.5, 2.5])
+    both = stcal.stack_tables([stcal.load_table(a)] * 2, ["first", "second"])
+    assert both.text("image") == ["0001", "0002"] * 2
 
 
 @pytest.mark.parametrize(
@@ -357,15 +365,3 @@ def test_files_of_one_kind_stand_below_each_other(tmp_path):
     assert np.allclose(found.points(), [[8, 8, 8], [7, 7, 7], [9, 9, 9]])
     assert np.allclose(found.points("commanded_"), [[1, 2, 3], [4, 5, 6], [1, 2, 3]])
     refuses("E-TABLES-NAMES … after … set", stack_tables, joined, ["after", "after"], {})
-
-
-def test_names_that_are_numbers_stay_as_they_are_written(tmp_path):
-    """Both columns are numbers in both files, and no float has these digits."""
-    stamps = "1700000000123456789", "1700000000223456789"
-    a = written(tmp_path / "a.csv", f"image,time_ns,x_mm\n0001,{stamps[0]},1.50\n0002,{stamps[1]},2.50\n")
-    b = written(tmp_path / "b.csv", "image,u_px\n0002,7\n0001,8\n")
-    joined = join_tables(a, b, "image").table
-    assert (joined.text("image"), joined.text("time_ns")) == (["0001", "0002"], list(stamps))
-    assert np.array_equal(joined.numbers("x_mm"), [1.5, 2.5])
-    both = stcal.stack_tables([stcal.load_table(a)] * 2, ["first", "second"])
-    assert both.text("image") == ["0001", "0002"] * 2

@@ -277,7 +277,7 @@ def driver(monkeypatch):
     return Own
 
 
-def test_what_was_really_set_is_written(driver, tmp_path):
+def test_what_was_really_set_is_written_and_a_camera_that_refuses_says_so(driver, tmp_path):
     source = OpenCVSource("/dev/video3", 2.0)
     found = capture(source, [10.0, 100.0], tmp_path / "scenes" / "a", 2.0, 0.0)
     assert [(row.exposure, row.exposure_set) for row in found.exposures] == [(10, 9), (100, 99)]
@@ -288,9 +288,6 @@ def test_what_was_really_set_is_written(driver, tmp_path):
     assert kept["camera"] == "camera /dev/video3"
     assert kept["exposures"][0]["exposure_set"] == 9
     assert source._capture.manual == module.MANUAL_V4L2
-
-
-def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
     for said in ("E-DEVICE-SETTING … 10", "E-DEVICE-NO-IMAGE"):
         driver.takes_exposure, driver.ends_after = said == "E-DEVICE-NO-IMAGE", 4
         refuses(said, capture, OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", None, 0.0)

@@ -43,7 +43,7 @@ def perturbed(transform, step: np.ndarray):
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
 @pytest.mark.parametrize("kind", NOISE)
-def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
+def test_the_fit_is_the_minimum_that_a_general_optimiser_finds_and_its_covariance_that_of_derivatives(model, kind):
     rng = np.random.default_rng(1)
     s = make_scene(rng, 12, sigma_mm=3)
     problem = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 12))
@@ -59,11 +59,6 @@ def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
     mine = (cost(np.zeros(model.parameters)) ** 2).sum()
     assert mine == pytest.approx(2 * best.cost, rel=1e-8)
     assert mine == pytest.approx(problem.squares(found).sum())
-
-
-@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
-@pytest.mark.parametrize("kind", NOISE)
-def test_the_covariance_is_that_of_numeric_derivatives(model, kind):
     rng = np.random.default_rng(2)
     s = make_scene(rng, 9)
     problem = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 9))

@@ -42,7 +42,7 @@ def fitted(a, b):
     return found, residual_field(found, inputs(found, a, b))
 
 
-def test_noise_is_not_taken_for_a_field():
+def test_noise_is_not_taken_for_a_field_which_predicts_new_places_and_knows_how_well():
     """One case in a hundred may be: more than one of 8 has a chance of 0.3 %."""
     seen = 0
     for seed in range(8):
@@ -50,9 +50,6 @@ def test_noise_is_not_taken_for_a_field():
         a = rng.uniform(-100, 100, (30, 3))
         seen += fitted(a, B_FROM_A @ a + rng.normal(0, SIGMA, a.shape))[1].seen
     assert seen <= 1
-
-
-def test_field_predicts_new_places_and_knows_how_well():
     squares, plain, corrected = [], [], []
     for seed in range(4):
         a, b = bent(seed, 80)

@@ -269,7 +269,7 @@ def urdf_pose(q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_a_file_of_another_program(tmp_path, convention):
+def test_a_file_of_another_program_and_two_arms_that_come_back(tmp_path, convention):
     path = written(tmp_path / "other.urdf", OTHER)
     found = load_urdf(path, convention=convention)
     assert (found.joints, found.from_link, found.to_link) == (("a1", "a2", "slide", "a4"), "base_link", "tool0")
@@ -282,6 +282,16 @@ def test_a_file_of_another_program(tmp_path, convention):
         assert np.abs(pose.matrix() - urdf_pose(each)).max() < 1e-9
     part = load_urdf(path, "l1", "plate", convention)
     assert part.joints == ("a2", "slide")
+    robot = two_arms(convention)
+    path = written(tmp_path / "a.urdf", robot_urdf(robot))
+    require_urdf_written(path, robot)
+    found = load_urdf(path, "", ["tool_left", "tool_right"], convention).robot
+    assert len(found.rows) == 14
+    assert sorted(found.tree.mounts) == [8]
+    q = joint_vectors(robot, 5, np.random.default_rng(0))
+    for name in ("left", "right"):
+        off = world_poses(found, q, f"tool_{name}").difference(world_poses(robot, q, name))
+        assert np.abs(off).max() < 1e-9
 
 
 GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4"/><child link="grip"/></joint>'
@@ -316,20 +326,6 @@ def test_mistakes_are_named(tmp_path, change, options, words):
         load_urdf(path, **options)
     assert words in str(caught.value)
     assert str(caught.value).startswith(f"URDF {path}: ")
-
-
-@pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_two_arms_come_back_from_a_urdf(tmp_path, convention):
-    robot = two_arms(convention)
-    path = written(tmp_path / "a.urdf", robot_urdf(robot))
-    require_urdf_written(path, robot)
-    found = load_urdf(path, "", ["tool_left", "tool_right"], convention).robot
-    assert len(found.rows) == 14
-    assert sorted(found.tree.mounts) == [8]
-    q = joint_vectors(robot, 5, np.random.default_rng(0))
-    for name in ("left", "right"):
-        off = world_poses(found, q, f"tool_{name}").difference(world_poses(robot, q, name))
-        assert np.abs(off).max() < 1e-9
 
 
 TWO_ARMS = """<robot name="cell"><link name="world"/>

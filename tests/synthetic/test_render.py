@@ -100,18 +100,13 @@ def test_circles_are_bright_or_dark_as_designed_and_noise_has_the_spread_asked_f
         assert around < 20 if made is scene else around > 160
 
 
-def test_clutter_adds_objects_behind_but_leaves_circles_alone(scene):
+def test_clutter_leaves_circles_alone_and_a_table_shows_dots_where_a_mirror_does(scene):
     plain, full = render(scene, "12", 0, PLAIN), render(scene, "12", 0, replace(PLAIN, clutter=True))
     assert 0.3 < (plain != full).mean() < 0.99
     assert (full > 100).sum() > 1.2 * (plain > 100).sum()
     seen = image_circles(scene, "12", 0)
     x, y = np.rint(seen.centre_px).astype(int).T
     np.testing.assert_array_equal(plain[y, x], full[y, x])
-
-
-def test_a_table_shows_dots_where_a_mirror_does_and_as_bright_as_its_reflectance(scene):
-    """The dots of the board: each is seen at its place mirrored at the table, 50 mm below all; nothing else changes."""
-    plain = render(scene, "12", 0, PLAIN)
     shiny = render(scene, "12", 0, replace(PLAIN, reflectance=0.6))
     group = scene.groups["12"]
     up = group.axes[1]
@@ -129,7 +124,7 @@ def test_a_table_shows_dots_where_a_mirror_does_and_as_bright_as_its_reflectance
 
 
 @pytest.mark.slow
-def test_vignetting_gradient_blur_and_exposure(second):
+def test_vignetting_gradient_blur_and_exposure_and_scenery_out_of_focus(second, optical):
     def picture(**changes):
         return render(second, "top-left", 1, replace(PLAIN, bit_depth=16, **changes)).astype(float)
 
@@ -141,6 +136,12 @@ def test_vignetting_gradient_blur_and_exposure(second):
     assert 1.99 < np.median(picture(exposure=2.0)[base < 30000] / base[base < 30000]) < 2.01
     assert picture(exposure=2.0).max() == 65535
     assert np.abs(np.diff(picture(blur_px=2.0), axis=1)).max() < 0.6 * np.abs(np.diff(base, axis=1)).max()
+
+    def steepest(lens):
+        picture = render(optical, "12", 0, replace(DEEP, clutter=True, blur_px=0, bit_depth=8, lens=lens))
+        return np.abs(np.diff(picture[:60].astype(float), axis=1)).max()  # the wall, above target and board
+
+    assert steepest(ThinLens(1.4, 24.0, 700.0)) < 0.5 * steepest(None)
 
 
 def test_rings_are_dots_with_a_hole_about_the_same_centre():
@@ -321,15 +322,6 @@ def test_all_in_focus_through_a_pinhole(optical, clutter):
     options = RenderOptions(clutter=clutter)
     closed = replace(options, lens=ThinLens(1e6, 24.0, 900.0))
     np.testing.assert_array_equal(render(optical, "12", 0, options), render(optical, "12", 0, closed))
-
-
-@pytest.mark.slow
-def test_scenery_is_out_of_focus_too(optical):
-    def steepest(lens):
-        picture = render(optical, "12", 0, replace(DEEP, clutter=True, blur_px=0, bit_depth=8, lens=lens))
-        return np.abs(np.diff(picture[:60].astype(float), axis=1)).max()  # the wall, above target and board
-
-    assert steepest(ThinLens(1.4, 24.0, 700.0)) < 0.5 * steepest(None)
 
 
 def test_truth_states_lens_and_rim_and_impossible_ones_are_refused(optical):

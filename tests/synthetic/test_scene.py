@@ -138,7 +138,7 @@ def test_simulated_centres_are_ellipse_centres(distortion, tolerance_px):
     assert 0.01 < np.linalg.norm(offset, axis=1).max() < 0.3
 
 
-def test_errors_say_what_to_do():
+def test_errors_say_what_to_do_and_a_plate_of_which_nothing_is_stated_what_is_assumed():
     refuses("E-SCENE-FACES", make_scene, replace(OPTIONS, groups=(("1", "3"),)))
     refuses("E-TARGET-NO-FACE … 9", make_scene, replace(OPTIONS, groups=(("1", "9"),)))
     refuses("E-SCENE-GROUP … 12", make_scene, replace(OPTIONS, groups=(("1", "2"), ("1", "2"))))
@@ -149,18 +149,7 @@ def test_errors_say_what_to_do():
     with fails_with("E-SCENE-FACES"):
         make_scene(OPTIONS, pair, nominal={"1": Rigid(), "2": Rigid(reference_target().rough_poses()["2"].rotation)})
     refuses("E-SIMULATE-OPTIONS … images_per_group … 0", SceneOptions, images_per_group=0)
-
-
-@pytest.mark.slow  # thousands of poses are tried
-def test_a_target_too_near_is_refused():
-    refuses("E-SCENE-VIEWS … a larger distance_mm", make_scene, replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
-
-
-def test_a_plate_of_which_nothing_is_stated_says_what_is_assumed():
-    """Plates of two faces at a right angle, circles 20 mm from the edge: 30 mm about them reach over it by 10 mm."""
-    target = reference_target()
     front, right = target.faces[:2]
-    pair = TargetDesign("pair", "bright", (front, right))
     across = (front.xy_mm[:, 0] + front.radius_mm).max() + 20.0
     inward = (right.xy_mm[:, 0] - right.radius_mm).min() - 20.0
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
@@ -170,6 +159,11 @@ def test_a_plate_of_which_nothing_is_stated_says_what_is_assumed():
         make_scene(replace(exact, margin_mm=30.0), pair, nominal=nominal)
     scene = make_scene(replace(exact, margin_mm=20.0), pair, nominal=nominal)
     assert scene.face_outline("1")[:, 0].max() == pytest.approx(across)
+
+
+@pytest.mark.slow  # thousands of poses are tried
+def test_a_target_too_near_is_refused():
+    refuses("E-SCENE-VIEWS … a larger distance_mm", make_scene, replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
 
 
 SMALL = SceneOptions(seed=5, width=324, height=216, images_per_group=2)

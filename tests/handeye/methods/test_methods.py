@@ -49,7 +49,8 @@ def test_noisy_poses_give_about_the_truth(method):
 
 
 @pytest.mark.parametrize("method", EXACT)
-def test_the_unit_of_the_poses_makes_no_difference(method):
+def test_the_unit_of_the_poses_and_motions_near_half_a_turn_make_no_difference(method):
+    """Tilts of ±80° and turns of ±160°: some motions exceed 170°; only methods that take logarithms lose poses."""
     truth = simulated(np.random.default_rng(5), 10, camera=(1e-3, 0.4))
     sides = (truth.pairs.base_from_flange, truth.pairs.camera_from_board)
     in_metres = HandEyePoses(*(Poses(p.rotation, p.translation / 1000) for p in sides))
@@ -57,11 +58,6 @@ def test_the_unit_of_the_poses_makes_no_difference(method):
     mm, m = (handeye(p, "eye-in-hand", method, options=o) for p, o in zip((truth.pairs, in_metres), known, strict=True))
     assert mm.mount_from_camera.rotation == pytest.approx(m.mount_from_camera.rotation, abs=1e-6)
     assert mm.mount_from_camera.translation == pytest.approx(1000 * m.mount_from_camera.translation, abs=2e-3)
-
-
-@pytest.mark.parametrize("method", EXACT)
-def test_motions_near_half_a_turn_are_no_trouble(method):
-    """Tilts of ±80° and turns of ±160°: some motions exceed 170°; only methods that take logarithms lose poses."""
     truth = simulated(np.random.default_rng(1), 14, robot=(3e-4, 0.1), camera=(1e-3, 0.3), tilt=1.4)
     angle, _ = off(found := handeye(truth.pairs, method=method), truth)
     assert 1e-6 < angle < 4e-3

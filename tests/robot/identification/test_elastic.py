@@ -80,11 +80,21 @@ def test_an_elastic_arm_is_told_and_predicted_also_by_its_file(bending, tmp_path
 
 
 @pytest.mark.slow
-def test_of_a_rigid_arm_the_rigid_model_is_taken():
+def test_of_a_rigid_arm_the_rigid_model_is_taken_and_sigma_elsewhere_hold_what_it_leaves():
+    """By the covariance alone 0.1 mm; the arm errs by twice that."""
     rigid = identify(mh80(), drawn(60, 1, 0.0)[1], AUTO)
     assert rigid.model == "rigid"
     assert rigid.robot.elasticity is None
     assert not rigid.gain.beyond_chance
+    true, data = drawn(100, 0)
+    rigid = identify(mh80(), data, RIGID)
+    assert any(note.startswith("σ hold for these rows, and for places like theirs") for note in rigid.notes)
+    assert "--model auto" in rigid.notes[-1]
+    alone = identify(mh80(), drawn(100, 0, 0.0)[1], RIGID)
+    assert not any(note.startswith("σ hold for these rows") for note in alone.notes)
+    assert rms(rigid.predicted.ranges_mm) > 1.5 * rms(alone.predicted.ranges_mm)
+    # what goes with the three strongest causes, of more
+    assert elsewhere(rigid, true) < 1.5 * rms(rigid.predicted.ranges_mm)
 
 
 @pytest.mark.full
@@ -115,20 +125,6 @@ def test_the_elasticity_of_the_file_stays_where_a_rigid_arm_is_asked_for_and_a_p
     assert "the arm as identified is rigid, payload_kg moves nothing" in found.notes[-1]
     text = evaluation_report(evaluate({"drawn": mh80()}, data)).text()
     assert "\nrobot drawn is rigid, payload_kg moves nothing" in text
-
-
-@pytest.mark.slow
-def test_sigma_elsewhere_hold_what_a_rigid_model_leaves():
-    """By the covariance alone 0.1 mm; the arm errs by twice that."""
-    true, data = drawn(100, 0)
-    rigid = identify(mh80(), data, RIGID)
-    assert any(note.startswith("σ hold for these rows, and for places like theirs") for note in rigid.notes)
-    assert "--model auto" in rigid.notes[-1]
-    alone = identify(mh80(), drawn(100, 0, 0.0)[1], RIGID)
-    assert not any(note.startswith("σ hold for these rows") for note in alone.notes)
-    assert rms(rigid.predicted.ranges_mm) > 1.5 * rms(alone.predicted.ranges_mm)
-    # what goes with the three strongest causes, of more
-    assert elsewhere(rigid, true) < 1.5 * rms(rigid.predicted.ranges_mm)
 
 
 CENTRE = np.array([0.0, 30.0, 120.0])

@@ -302,11 +302,22 @@ def test_another_convention_is_named(order, conjugated, said):
     assert str(caught.value).endswith(said)
 
 
-def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
+def test_orientations_that_no_convention_mends_are_left_to_the_adjustment_and_a_target_that_slipped_is_named():
     """One orientation in all rows, whatever the joints do."""
     data = seen(1, 20)
     still = np.tile(Rigid.exp([0.4, -0.3, 0.9, 0, 0, 0]).rotation, (20, 1, 1))
     start(mh80(), replace(data, rotations=still))
+    rng = np.random.default_rng(1)
+    true = placed(
+        made(mh80(), rng), Rigid.exp([0.1, -0.05, 2.1, 2500, -900, 400]), {"": Rigid.exp([0, 0.1, 0, 220, 60, 150])}
+    )
+    slipped = replace(true, tools={"": Rigid.exp([0.2, 0.1, 0.4, 120, 160, 180])})
+    q = joint_vectors(true, 60, rng)
+    parts = [measured(robot, q[rows], rng) for robot, rows in ((true, slice(30)), (slipped, slice(30, 60)))]
+    positions = np.vstack([part.positions for part in parts])
+    data = Measurements.from_arrays(q, positions)
+    with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
+        identify(mh80(), data, IdentifyOptions(folds=0))
 
 
 def turned(*quarters):
@@ -385,17 +396,3 @@ def test_rows_that_repeat_a_position_and_an_instrument_that_moved_far_are_named(
     if not starts:
         positions[20:] = positions[19]
     refuses(f"E-IDENTIFY-MISFIT … {named}", start, mh80(), replace(data, positions=positions))
-
-
-def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():
-    rng = np.random.default_rng(1)
-    true = placed(
-        made(mh80(), rng), Rigid.exp([0.1, -0.05, 2.1, 2500, -900, 400]), {"": Rigid.exp([0, 0.1, 0, 220, 60, 150])}
-    )
-    slipped = replace(true, tools={"": Rigid.exp([0.2, 0.1, 0.4, 120, 160, 180])})
-    q = joint_vectors(true, 60, rng)
-    parts = [measured(robot, q[rows], rng) for robot, rows in ((true, slice(30)), (slipped, slice(30, 60)))]
-    positions = np.vstack([part.positions for part in parts])
-    data = Measurements.from_arrays(q, positions)
-    with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
-        identify(mh80(), data, IdentifyOptions(folds=0))

@@ -94,7 +94,7 @@ def test_derivatives_are_those_of_differences(kind, tree):
         )
 
 
-def test_held_out_error_is_that_of_new_poses():
+def test_held_out_error_is_that_of_new_poses_and_a_flat_direction_is_no_failure():
     true, data = simulated(5, 60)
     found = identify(mh80(), data, IdentifyOptions(repeats=1))
     assert found.ranks == {"pose": 30, "position": 27, "distance": 21}
@@ -105,6 +105,11 @@ def test_held_out_error_is_that_of_new_poses():
     expected = np.hypot(0.05 * np.sqrt(8 / np.pi), model.mean())
     assert found.held_out.position_mm.mean() == pytest.approx(expected, rel=0.25)
     assert found.held_out.position_mm.mean() > found.fitted_mm.mean()
+    study = load_script("identify_study")
+    case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
+    predicted, parameters = study.errors(case, 45)
+    assert 0.1 < predicted < 3  # mean of 49 squares, correlated
+    assert 0.3 < parameters < 2.2  # of 21 squares
 
 
 def squares(found: Identified, true: Robot, seed: int, kind: str = "position"):
@@ -138,15 +143,6 @@ def test_the_covariance_is_true(count):
     # Those of the rows are correlated: √(2 / 9) at the most or so.
     assert np.mean(errors) == pytest.approx(1, abs=3 * np.sqrt(2 / 27 / draws))
     assert np.mean(rows) == pytest.approx(1, abs=3 * np.sqrt(2 / 9 / draws))
-
-
-def test_a_flat_direction_is_no_failure():
-    """Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times."""
-    study = load_script("identify_study")
-    case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
-    predicted, parameters = study.errors(case, 45)
-    assert 0.1 < predicted < 3  # mean of 49 squares, correlated
-    assert 0.3 < parameters < 2.2  # of 21 squares
 
 
 def test_an_outlier_is_named_and_does_no_harm():
