@@ -150,7 +150,7 @@ def stream(times=EVERY, noise=(0.0, 0.0)) -> Stream:
     return Stream.of([Decimal(repr(round(float(t), 6))) for t in times], poses, "robot.csv")
 
 
-def test_a_cubic_meets_the_swing_by_samples_in_any_order_and_at_both_ends():
+def test_a_cubic_meets_the_trajectory_by_samples_in_any_order_and_at_both_ends():
     """Of samples h = 50 ms apart it errs by at most 3/128 h⁴ |y⁗|: y⁗ = 80 mm · 1.3⁴ = 230 mm/s⁴ gives 34 nm, that of
     rotations by their changing axis too; lines between samples would err by h²/8 |ÿ| = 0.04 mm."""
     off = np.abs(stream().at(AT).difference(swing(AT, PHASE)))

@@ -303,11 +303,11 @@ def test_commands_of_another_robot_are_said(off_mm, warned):
     wrong = commanded + off_mm * away / np.linalg.norm(away, axis=1, keepdims=True)
     warnings = verified(commanded, a=wrong / verified(commanded, a=wrong).sets[0].scale).warnings()
     assert len(warnings) == warned
-    assert all("set a: measured_mm distances miss the commanded ones by" in warning for warning in warnings)
+    assert all("set a: measured distances miss the commanded ones by" in warning for warning in warnings)
 
 
 def verified(commanded: np.ndarray, **sets: np.ndarray) -> Verification:
-    """Of sets of poses P1, P2 … that are commanded to (m, 3) and measured_mm at (m, 3)."""
+    """Of sets of poses P1, P2 … that are commanded to (m, 3) and measured at (m, 3)."""
     m, names = len(commanded), tuple(f"P{i}" for i in range(1, len(commanded) + 1)) * len(sets)
     of_sets, every = np.repeat(list(sets), m).tolist(), np.tile(commanded, (len(sets), 1))
     return verify(
@@ -316,7 +316,7 @@ def verified(commanded: np.ndarray, **sets: np.ndarray) -> Verification:
 
 
 def ten_poses(change) -> str:
-    """What is doubted of ten poses in a metre, measured_mm in another frame to 0.2 mm, with ``change`` made to them."""
+    """What is doubted of ten poses in a metre, measured in another frame to 0.2 mm, with ``change`` made to them."""
     rng = np.random.default_rng(4)
     commanded = rng.uniform(-500, 500, (10, 3))
     at = MOVED @ (commanded + rng.normal(0, 0.2, commanded.shape))
@@ -324,7 +324,7 @@ def ten_poses(change) -> str:
 
 
 def ten_of_two_sets(first, second) -> Verification:
-    """Ten poses in two sets, each measured_mm to ``first`` and ``second`` mm in the robot's frame."""
+    """Ten poses in two sets, each measured to ``first`` and ``second`` mm in the robot's frame."""
     rng = np.random.default_rng(5)
     commanded = rng.uniform(-500, 500, (10, 3))
     before, after = (commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second))
@@ -340,7 +340,7 @@ def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     assert "1.00200 times the commanded ones, which is most of its error" in larger.warnings()[0]
     assert "are the commanded ones to the last digit" in ten_of_two_sets(0.0, 0.1).warnings()[0]
     both = ten_of_two_sets(1.0, 0.0)
-    assert "set after: measured_mm positions are the commanded ones" in both.warnings()[0]
+    assert "set after: measured positions are the commanded ones" in both.warnings()[0]
     exact = ten_of_two_sets(0.0, 0.0)  # no error, and no reduction of it
     assert np.isnan(exact.reduction(1)["mean"])
     json.dumps(VerificationFile.model_validate(exact).content(), allow_nan=False)
