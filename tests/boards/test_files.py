@@ -219,6 +219,7 @@ def test_the_reference_and_opencvs_grid_have_the_published_layout_and_boards_hav
     np.testing.assert_array_equal(board.xy_mm(), [[0, 0], [10, 0], [20, 0], [0, 10], [10, 10], [20, 10]])
     assert board.labels() == ["board:0:0", "board:0:1", "board:0:2", "board:1:0", "board:1:1", "board:1:2"]
     assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
+    # OpenCV's documented layout: x = (2 j + i mod 2) · spacing, y = i · spacing.
     xy = CIRCLES.xy_mm()
     assert np.allclose(xy[[0, 1, 4, 5, 8, 43]], [[0, 0], [40, 0], [20, 20], [60, 20], [0, 40], [120, 200]])
 

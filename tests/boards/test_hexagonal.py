@@ -50,6 +50,7 @@ def test_six_neighbours_are_one_spacing_away_and_a_covered_strip_is_said():
     lattice = board.lattice()
     np.testing.assert_allclose(lattice.xy_mm() - lattice.xy_mm()[0], board.xy_mm() - board.xy_mm()[0], atol=1e-12)
     np.testing.assert_allclose(lattice.places_mm(lattice.labels())[:, :2], lattice.xy_mm(), atol=1e-12)
+    # Of a covered strip it is open which columns are seen: they are all alike.
     board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
     view, why = find_board(view_of(board, TILTS[1], (112.0, -np.inf))[0], "a", CAMERA, board)
     assert view is None

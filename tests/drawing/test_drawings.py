@@ -239,7 +239,7 @@ def test_pages_of_a_pdf_have_the_size_of_the_paper_and_a_net_is_on_one_sheet(fil
     for sheet, size in zip(drawn.sheets, sizes, strict=True):
         np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
         assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
-    drawn = draw(target, tmp_path / "net.pdf", net=True)
+    drawn = draw(target, tmp_path / "net.pdf", net=True)  # 400 × 200 mm and more
     assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
     refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
     assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))

@@ -124,6 +124,7 @@ def test_a_robot_that_does_not_reach_the_poses_taken_is_refused_and_a_limit_that
     save_robot(robot_file, replace(arm, rows=tuple(replace(row, a=row.a / 9, d=row.d / 9) for row in arm.rows)))
     said = "reaches 0 of the 6 poses taken, first not line 2; give the robot's own file"
     assert_error(command("plan", poses, "--robot", robot_file), INPUT, said)
+    # The limit is halfway between the second and third value of the first joint.
     first = np.sort(inverse(arm, TAKEN.pairs.base_from_flange).q[:, 0])
     assert (np.abs(first) < np.radians(60)).all()  # so that turned round the robot would have to bend over backwards
     limited = Joint("revolute", float(first[1:3].mean()), np.radians(60))

@@ -106,6 +106,7 @@ def test_a_seed_and_a_trial(capsys):
     study.print_tables([found])
     assert "| about the closed form: ±10°, ±20 mm |" in capsys.readouterr().out
     trial, method = load_script("handeye_study").camera_trial, "reprojection, camera solved for"
+    # The square of six numbers of σ 1 is below 34 but once in 10⁵.
     by_sigma, off_mm2 = trial(method, "eye-to-hand", "camera ≈ robot", 1.0, 3)
     assert 0.1 < by_sigma < 34
     assert off_mm2 > 0

@@ -67,6 +67,7 @@ def test_a_comment_does_not_tell_the_form_and_metashapes_fisheye_has_its_own_for
     assert get_args(Form) == tuple(WRITERS)
     text = "# as the lensmodel of mrcal\n1 PINHOLE 1280 961 812.25 809.5 640.125 478.0625\n"
     assert read_camera(written(tmp_path / "cameras.txt", text)).colmap_model == "PINHOLE"
+    # u = w/2 + cx + x' (f + b1), p1 beside r² + 2 x²; the first pixel is at 0.5.
     lens, rays = read_lens(written(tmp_path / "c.xml", METASHAPE.replace("frame", "fisheye"))), camera_files.RAYS
     radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
     turned = rays[:, :2] * np.arctan(radius) / radius

@@ -313,6 +313,7 @@ def test_rows_of_one_key_stand_side_by_side_and_names_that_are_numbers_as_they_a
     assert found.table.text("status") == ["ok", "ok"]
     assert "bcov_x_x" in found.table
     assert found.notes == (f"1 rows of {a} have no partner: image p9",)
+    # Both columns are numbers in both files, and no float has these digits.
     stamps = "1700000000123456789", "1700000000223456789"
     a = written(tmp_path / "c.csv", f"image,time_ns,x_mm\n0001,{stamps[0]},1.50\n0002,{stamps[1]},2.50\n")
     b = written(tmp_path / "d.csv", "image,u_px\n0002,7\n0001,8\n")

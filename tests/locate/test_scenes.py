@@ -101,6 +101,7 @@ def test_tags_of_another_target_are_named_and_a_camera_file_of_another_camera_is
     other = TargetLayout("other", tags, LAYOUT.corners_mm, LAYOUT.covariance_mm2, 0)
     result = in_scene(seen, other, MODEL, plain)
     assert "no tag of the layout, but others of its dictionaries" in result.verdict.reasons[0]
+    # A focal length that is half as long again shows in a near, tilted plane.
     far_off = Camera(1200, 900, 1.5 * CAMERA.focal, CAMERA.centre, np.zeros(8))
     model = CameraModel(far_off.focal, far_off.centre, far_off.distortion, "PINHOLE", 1200, 900, "test")
     assert in_scene(seen, LAYOUT, model).verdict.decision == "reject"

@@ -45,6 +45,7 @@ def test_a_plane_is_refused_affinely_one_point_off_a_line_is_named_and_outliers_
     raised = np.vstack([a[:12], [[0, 0, 90]]])
     found = register(raised, seen_of(raised), model="affine", method="least-squares", folds=0)
     assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
+    # Any one wrong point off the line fits exactly, and would set the turn about it.
     a = np.vstack([along_a_line(12, 0.0), [[0, 80, 0]]])
     found = register(a, seen_of(a), folds=0, lines=range(2, 15))
     assert any("only line 14 keeps the points off a line" in note for note in found.notes)

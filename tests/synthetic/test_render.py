@@ -107,6 +107,7 @@ def test_clutter_leaves_circles_alone_and_a_table_shows_dots_where_a_mirror_does
     seen = image_circles(scene, "12", 0)
     x, y = np.rint(seen.centre_px).astype(int).T
     np.testing.assert_array_equal(plain[y, x], full[y, x])
+    # The dots of the board: each is seen mirrored at the table, 50 mm below all; nothing else changes.
     shiny = render(scene, "12", 0, replace(PLAIN, reflectance=0.6))
     group = scene.groups["12"]
     up = group.axes[1]

@@ -149,6 +149,7 @@ def test_errors_say_what_to_do_and_a_plate_of_which_nothing_is_stated_what_is_as
     with fails_with("E-SCENE-FACES"):
         make_scene(OPTIONS, pair, nominal={"1": Rigid(), "2": Rigid(reference_target().rough_poses()["2"].rotation)})
     refuses("E-SIMULATE-OPTIONS … images_per_group … 0", SceneOptions, images_per_group=0)
+    # Plates of two faces at a right angle, circles 20 mm from the edge: 30 mm about them reach over it by 10 mm.
     front, right = target.faces[:2]
     across = (front.xy_mm[:, 0] + front.radius_mm).max() + 20.0
     inward = (right.xy_mm[:, 0] - right.radius_mm).min() - 20.0

@@ -62,6 +62,7 @@ def test_the_text_has_the_transform_with_its_sigma_of_which_every_one_has_a_name
     assert f"pitch {25 * result.scale:.4f} ± {25 * result.sigma_scale:.4f} mm, stated 25 mm" in text
     assert "held out (2 × 2 of 10 poses), mean: rotation" in text
     assert re.search(r"corner in the image +\S+ px +estimated", text)
+    # A camera file that is off: its σ are widened, and the factor is among the σ.
     truth = simulated_views(np.random.default_rng(2), 7, "eye-in-hand", (2e-4, 0.1), 0.1)
     wrong = replace(truth.views.camera, focal=1.02 * truth.views.camera.focal)
     options, views = (
