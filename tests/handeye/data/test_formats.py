@@ -51,6 +51,15 @@ def read(arguments, path=None):
     return Files(Path(first), second=second, statements=said).read()
 
 
+def refused(path, said=None, call=read_robot) -> str:
+    with pytest.raises(InputError) as caught:
+        call(path, said or Said())
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_poses(name, tmp_path):
     found = read(FORMATS[name](tmp_path, PAIRS))
@@ -65,16 +74,10 @@ def test_other_formats_are_refused_in_a_line(name, tmp_path):
     """As the robot's poses beside images, as one of two files, and as pairs."""
     path = written(tmp_path / "poses", REFUSED[name])
     np.save(tmp_path / "b.npy", np.array([pose.matrix() for pose in PAIRS.camera_from_board])[:1])
-    for call in (
-        lambda: read_robot(path, Said()),
-        Files(path, second=tmp_path / "b.npy", statements=Said(rotation="rotvec-rad", length_unit="m")).read,
-        Files(path).read,
-    ):
-        with pytest.raises(InputError) as caught:
-            call()
-        message = str(caught.value)
-        assert "\n" not in message
-        assert str(path) in message
+    said = Said(rotation="rotvec-rad", length_unit="m")
+    refused(path)
+    refused(path, said, lambda path, said: Files(path, second=tmp_path / "b.npy", statements=said).read())
+    refused(path, call=lambda path, said: Files(path, statements=said).read())
 
 
 def test_names_of_rows_are_those_of_images(tmp_path):
@@ -227,15 +230,6 @@ def test_covariances_are_read_and_turned_over(tmp_path):
 
 FIVE = simulated(np.random.default_rng(5), 5).pairs
 GOOD = FIVE.base_from_flange.matrix()
-
-
-def refused(path, said=None, call=read_robot) -> str:
-    with pytest.raises(InputError) as caught:
-        call(path, said or Said())
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
-    return message
 
 
 def changed(i: int, edit) -> np.ndarray:
