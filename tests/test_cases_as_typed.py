@@ -22,7 +22,7 @@ from stcal.boards.board_file import load_board
 from stcal.boards.target_file import load_target
 from stcal.cli.main import main, main_sfm
 from stcal.io.table import read_table
-from tests.io.reported_cameras import SAMPLES
+from tests.io.test_shared_cases import SAMPLES
 from tests.levels import FULL
 from tests.outcome import COMPUTATION, INPUT, Outcome, assert_error, ended, lines_of
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.sfm.detect.degraded import Bench
-from tests.support.photograph import read_set
+from tests.support.degrade import read_set
 
 
 @pytest.fixture(scope="module")

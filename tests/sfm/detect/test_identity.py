@@ -23,7 +23,7 @@ from stcal.sfm.detect.face_patterns import find_faces, find_mirrored, mirror_ima
 from stcal.sfm.detect.image import image_corners
 from tests.outcome import refuses
 from tests.sfm.detect.test_arrangement import centres_of
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.areas import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
 TARGET = reference_target()

@@ -153,7 +153,7 @@ def test_a_group_without_the_board_and_a_photograph_in_two_groups(small_set, sma
 
 @pytest.mark.parametrize("kind", ["target", "board"])
 def test_a_design_that_is_missing(small_set, stcal_sfm, kind):
-    """Impossible ones are in tests/boards/test_target_files.py."""
+    """Impossible ones are in tests/boards/test_files.py."""
     path = (small := small_set("12")).folder / "none.toml"
     outcome = stcal_sfm(*small.arguments(f"--{kind}", path))
     assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(path), "`stcal-sfm init DIR` writes one")
