@@ -15,7 +15,7 @@ from stcal.handeye.data.pose_content import PoseSide
 from stcal.handeye.data.pose_pairs import SETUPS
 from stcal.handeye.data.pose_partners import paired
 from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
-from stcal.handeye.time_offset import TimeOffset, estimate_offset
+from stcal.handeye.time_offset import estimate_offset
 from stcal.workflows.handeye_inputs import times_of_images
 from tests.handeye.photographed import BOARD
 from tests.handeye.test_cli import in_sigmas
@@ -25,13 +25,9 @@ from tests.shared import written
 from tests.support.handeye import StreamTruth, disturbed, handeye, simulated_stream, squared, swing
 
 
-def found_of(truth: StreamTruth) -> TimeOffset:
-    return estimate_offset(truth.pairs, truth.stream, truth.seconds, truth.setup)
-
-
 def squares(truth: StreamTruth) -> tuple[float, float]:
     """Errors of the offset and of X (over six numbers), in units of σ²."""
-    found = found_of(truth)
+    found = estimate_offset(truth.pairs, truth.stream, truth.seconds, truth.setup)
     pairs = replace(truth.pairs[np.flatnonzero(found.kept)], base_from_flange=found.base_from_flange)
     result = found.carried(handeye(pairs, truth.setup, "pose"))
     off_s = found.seconds - truth.offset_s

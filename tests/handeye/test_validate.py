@@ -188,13 +188,10 @@ def filed(truth, camera):
     return pairs_of_views(truth.pairs.base_from_flange, views, truth.pairs.names), views
 
 
-def prior_of(camera):
-    return camera_prior(Camera.of(camera, "OPENCV"))
-
-
 def chosen(truth, camera=CAMERA, count=10, seed=0):
     pairs, views = filed(truth, camera)
-    return choose(HandEyeProblem(pairs, truth.setup, views), prior_of(camera), splits(len(pairs), None, count, seed))
+    prior = camera_prior(Camera.of(camera, "OPENCV"))
+    return choose(HandEyeProblem(pairs, truth.setup, views), prior, splits(len(pairs), None, count, seed))
 
 
 def off_mm(found, truth):

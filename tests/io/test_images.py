@@ -330,14 +330,11 @@ def scene(seed: int = 0) -> np.ndarray:
     return light + rng.normal(0, 0.005, COLUMN.shape)
 
 
-def mosaic(pattern: str, light: np.ndarray) -> np.ndarray:
-    gain = np.array([GAIN[colour] for colour in pattern]).reshape(2, 2)
-    return np.round(255 * light * np.tile(gain, (120, 160))).astype(np.uint8)
-
-
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_a_mosaic_is_refused(tmp_path, pattern):
-    cv2.imwrite(str(tmp_path / "a.png"), mosaic(pattern, scene()))
+    gain = np.array([GAIN[colour] for colour in pattern]).reshape(2, 2)
+    mosaic = np.round(255 * scene() * np.tile(gain, (120, 160))).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), mosaic)
     refuses(f"E-IMAGE-MOSAIC … a.png … {pattern}", find_images, tmp_path)
 
 

@@ -14,16 +14,12 @@ from stcal.report.svg import Axes, Drawing, save
 from tests.outcome import refuses
 
 
-def tree_of(drawing: Drawing) -> ElementTree.Element:
-    """The drawing as a reader of XML takes it."""
-    return ElementTree.fromstring(base64.b64decode(drawing.uri().partition(",")[2]))
-
-
 @pytest.mark.parametrize("name", ["$x^{", "面", "_$\\frac", "<a & 'b'>", "\x07bell", "\udcff.jpg"])
 def test_any_name_can_be_written(name):
     drawing = Drawing(1, 1)
     drawing.words((0, 0), name)
-    (text,) = tree_of(drawing).iter("{http://www.w3.org/2000/svg}text")
+    tree = ElementTree.fromstring(base64.b64decode(drawing.uri().partition(",")[2]))
+    (text,) = tree.iter("{http://www.w3.org/2000/svg}text")
     assert text.text == name.replace("\x07", "\ufffd").replace("\udcff", "\\udcff")
 
 

@@ -103,14 +103,10 @@ def test_a_tracker_that_moved_between_two_rows_is_located():
     assert "column station" in note
 
 
-def true_axes(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    rotation, origin = joint_frames(robot.chain(), np.zeros((1, len(robot.rows))))
-    return rotation[:, 0, :, 2], origin[:, 0]
-
-
 def errors_of(frames, robot: Robot) -> np.ndarray:
     """Of all axes of a true robot, one after the other."""
-    pairs = zip(frames, *true_axes(robot), robot.prismatic, strict=True)
+    rotation, origin = joint_frames(robot.chain(), np.zeros((1, len(robot.rows))))
+    pairs = zip(frames, rotation[:, 0, :, 2], origin[:, 0], robot.prismatic, strict=True)
     return np.concatenate([axis_error(*each) for each in pairs])
 
 
