@@ -88,9 +88,7 @@ def swept(cell):
     q = np.concatenate([SWEEPS, cell.about(30)])
     names = [*(f"a/{i:03d}.png" for i in range(len(q) - 1)), "a/lost.png"]
     wanted, options = targets(None, cell.about(12)), IdentifyOptions(folds=2, repeats=1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)  # of rows left out the result knows by their influence
-        return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted, options)
+    return work.from_measured("views", cell.measured(q), joint_table(q, names), mh80(), wanted, options)
 
 
 @pytest.mark.slow

@@ -195,8 +195,7 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
     assert json.loads(out.read_text())["notes"] == ["column not read: load"]
 
 
-def test_notes_of_sweeps(data, stcal_robot, monkeypatch):
-    monkeypatch.setattr("stcal.robot.axes.axes_model.REFITTED", 0)
+def test_notes_of_sweeps(data, stcal_robot):
     rest, out = np.radians([10, 20, -20, 15, 40, 5.0]), data.folder / "out.json"
     q = np.array([rest + np.eye(6)[i] * step for i in range(6) for step in np.linspace(-0.6, 0.6, 5)])
     data.seen = measured(data.true, q, np.random.default_rng(1))
