@@ -64,8 +64,8 @@ def refused(path, said=None, call=read_robot) -> str:
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_poses(name, tmp_path):
     found = read(FORMATS[name](tmp_path, PAIRS))
-    for name, wanted in sides_of(PAIRS).items():
-        assert np.abs(getattr(found.pairs, name).difference(wanted)).max() < ROUNDING
+    for side, wanted in sides_of(PAIRS).items():
+        assert np.abs(getattr(found.pairs, side).difference(wanted)).max() < ROUNDING
     assert len(found.understood) >= 2 or name == "columns in metres"  # whose names say it all
     assert found.left_out == ()
 
