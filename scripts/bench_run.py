@@ -41,7 +41,7 @@ from stcal.sfm.detect.detect_files import detect_files
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.support.arms import LEFT, MARKERS, RIGHT, elastic, two_arms
-from tests.support.film import filmed
+from tests.support.image_poses import filmed
 
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot

@@ -31,6 +31,22 @@ def ended(main: Callable[[], object], capture) -> Outcome:
     return Outcome(end.value, *capture.readouterr())
 
 
+def program(*first: str):
+    """A fixture that calls a program in this process, with these words before those of the call."""
+
+    @pytest.fixture
+    def call(monkeypatch, capsys) -> Callable[..., Outcome]:
+        from stcal.cli.main import main
+
+        def called(*words) -> Outcome:
+            monkeypatch.setattr("sys.argv", [*first, *map(str, words)])
+            return ended(main, capsys)
+
+        return called
+
+    return call
+
+
 @contextmanager
 def fails_with(error: str) -> Iterator[pytest.ExceptionInfo[StcalError]]:
     """Expect an error by its code and what it names, in this order: ``E-POINTS-FEW … 2 … 3``.

@@ -1,5 +1,6 @@
 """Data that tests share: made once for all processes of a test run, not to be written to."""
 
+import csv
 import ctypes
 import json
 import os
@@ -79,6 +80,19 @@ def own_copy(source: Path, to: Path, ignore: Callable | None = None) -> Path:
     if source.is_dir():
         return Path(shutil.copytree(source, to, ignore=ignore, copy_function=shutil.copyfile, dirs_exist_ok=True))
     return Path(shutil.copyfile(source, to / source.name if to.is_dir() else to))
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    """The path, with this content in its file."""
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def write_rows(path: Path, header, rows) -> Path:
+    """The path, with a table in its file."""
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+    return path
 
 
 def unsealed_copy(run: Path, to: Path, ignore: Callable | None = None) -> Path:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from stcal import load_board, load_target
 from stcal.cli.main import main, main_sfm
 from stcal.io.table import read_table
-from tests.io.reported_cameras import SAMPLES
+from tests.io.test_shared_cases import SAMPLES
 from tests.levels import FULL
 from tests.outcome import COMPUTATION, INPUT, Outcome, assert_error, ended, lines_of
 

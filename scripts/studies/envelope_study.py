@@ -37,7 +37,7 @@ from stcal.sfm.pipeline import run
 from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.saved import RunResult
 from tests.support import degrade
-from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
+from tests.support.degrade import Photograph, Plane, RenderedSet, read_set
 
 NEAR_PX, NEAR_RADII = 1.5, 0.25
 SILENT_SIGMA = 4.0

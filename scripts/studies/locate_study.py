@@ -29,7 +29,7 @@ from stcal.locate.verdict import PatentOptions, VerdictOptions
 from stcal.parallel import one_thread
 from stcal.workflows.board_views import calibration_images
 from tests.support.areas import homography, rendered, squares_nees, warped
-from tests.support.holdout import PoseTrial, half_calibrated, subset_trials
+from tests.support.tags import PoseTrial, half_calibrated, subset_trials
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17

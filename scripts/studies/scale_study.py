@@ -27,7 +27,7 @@ from stcal.sfm.runs.run_options import RunOptions
 from stcal.sfm.runs.stages import Groups, Task, map_groups
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
-from tests.support.circle_images import simulate_centres
+from tests.support.areas import simulate_centres
 
 NOISE_PX = 0.02
 MISSING = 0.1

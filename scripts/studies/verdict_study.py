@@ -44,8 +44,8 @@ from stcal.sfm.report.check import CAUSE, ranked
 from stcal.sfm.runs.stages import LIKELY, explained, refine_or_explain, wrong_file
 from stcal.synthetic.designs import second_design
 from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, make_scene
-from tests.support.circle_images import circle_conic, ellipse_of_conic
-from tests.support.photograph import read_set
+from tests.support.areas import circle_conic, ellipse_of_conic
+from tests.support.degrade import read_set
 
 NOISE_PX = 0.02
 SILENT_SIGMA = 4.0

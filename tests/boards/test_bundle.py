@@ -12,6 +12,7 @@ from stcal.locate.layout import load_layout, load_plan
 from stcal.locate.scenes import find_scenes, run
 from tests.boards.drawn import kalibr_tag
 from tests.outcome import refuses
+from tests.shared import written
 
 BUNDLE = """standalone_tags: []
 tag_bundles:
@@ -21,12 +22,6 @@ tag_bundles:
 """
 """Tag 1 stands 120 mm to the right of tag 0 and 50 mm above, and is turned to the left by 90°."""
 FOCAL, WIDTH, HEIGHT = 1000.0, 1200, 900
-
-
-def written(tmp_path, text):
-    path = tmp_path / "tags.yaml"
-    path.write_text(text)
-    return path
 
 
 def sheet():
@@ -52,7 +47,9 @@ def test_a_photograph_of_a_bundle(tmp_path):
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / "0.png"), cv2.GaussianBlur(photo, (0, 0), 1.0))
     camera = CameraModel((FOCAL, FOCAL), (600.0, 450.0), np.zeros(12), "PINHOLE", WIDTH, HEIGHT, "test")
-    located = next(iter(run(find_scenes(tmp_path / "images"), load_layout(written(tmp_path, BUNDLE)), camera)))
+    located = next(
+        iter(run(find_scenes(tmp_path / "images"), load_layout(written(tmp_path / "tags.yaml", BUNDLE)), camera))
+    )
     assert located.verdict.decision == "accept"
     pose = located.pose.camera_from_obj
     # {obj}: Z into the target as the camera looks; X to the left and Y up, half a turn about Z.
@@ -63,17 +60,17 @@ def test_a_photograph_of_a_bundle(tmp_path):
     assert abs(pose.translation[2] - 500) < 2
 
 
-def test_tags_that_stand_as_opencv_draws_them(tmp_path):
-    as_april = load_layout(written(tmp_path, BUNDLE)).corners_mm
-    upright = load_layout(written(tmp_path, "upright: true\n" + BUNDLE)).corners_mm
+def test_tags_that_stand_as_opencv_draws_them_and_standalone_ones_without_a_place(tmp_path):
+    as_april = load_layout(written(tmp_path / "tags.yaml", BUNDLE)).corners_mm
+    upright = load_layout(written(tmp_path / "tags.yaml", "upright: true\n" + BUNDLE)).corners_mm
     np.testing.assert_allclose(upright[0], [[-40, -40], [40, -40], [40, 40], [-40, 40]], atol=1e-9)
     np.testing.assert_allclose(upright[1].mean(axis=0), [120, -50], atol=1e-9)
     np.testing.assert_allclose(as_april[1].mean(axis=0), [-120, 50], atol=1e-9)
-    assert load_flat_board(written(tmp_path, BUNDLE)).tags == (("DICT_APRILTAG_36h11", 0), ("DICT_APRILTAG_36h11", 1))
-
-
-def test_standalone_tags_have_no_place(tmp_path):
-    plan = load_plan(written(tmp_path, "tag_family: tag25h9\nstandalone_tags: [{id: 3, size: 0.05}]\n"))
+    assert load_flat_board(written(tmp_path / "tags.yaml", BUNDLE)).tags == (
+        ("DICT_APRILTAG_36h11", 0),
+        ("DICT_APRILTAG_36h11", 1),
+    )
+    plan = load_plan(written(tmp_path / "tags.yaml", "tag_family: tag25h9\nstandalone_tags: [{id: 3, size: 0.05}]\n"))
     assert plan.tags == (("DICT_APRILTAG_25h9", 3),)
     assert np.isnan(plan.corners_mm).all()
 
@@ -91,7 +88,7 @@ def test_standalone_tags_have_no_place(tmp_path):
     ],
 )
 def test_mistakes_in_bundles(tmp_path, text, error):
-    refuses(error, load_layout, written(tmp_path, text))
+    refuses(error, load_layout, written(tmp_path / "tags.yaml", text))
 
 
 def test_names_of_families():

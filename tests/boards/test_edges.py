@@ -16,7 +16,7 @@ from tests.support.areas import homography, rendered, squares_nees, warped
 NAME = "DICT_APRILTAG_36h11"
 
 
-def test_the_integrated_step_and_its_derivatives():
+def test_the_integrated_step_its_derivatives_and_an_edge_whose_equations_are_singular():
     distance, normal, h = np.linspace(-3, 3, 13)[None], np.array([[0.6, 0.8]]), 1e-4
     share, slope, widening = integrated_step(distance, normal, np.array([0.3]))
     by_distance = [integrated_step(distance + s, normal, np.array([0.3])) for s in (h, -h)]
@@ -24,6 +24,12 @@ def test_the_integrated_step_and_its_derivatives():
     assert np.allclose((by_distance[0][0] - by_distance[1][0]) / (2 * h), slope, atol=1e-6)
     assert np.allclose((by_variance[0][0] - by_variance[1][0]) / (2 * h), widening, atol=1e-6)
     assert np.allclose([share[0, 0], share[0, 6], share[0, -1]], [0, 0.5, 1], atol=1e-5)
+    design = np.random.default_rng(1).normal(size=(2, 3, 4, 2))
+    design[1] = 1e12  # two unknowns that move all pixels alike
+    values, inverse = solved(design, np.ones((2, 3, 4)), np.ones((2, 3, 4)))
+    assert np.isfinite(inverse[0]).all()
+    assert np.isfinite(values[0]).all()
+    assert np.isnan(inverse[1]).all()
 
 
 @pytest.mark.parametrize(("degrees", "by_warp"), [(0.0, False), (1.0, False), (20.0, False), (45.0, True)])
@@ -93,12 +99,3 @@ def test_sigma_of_a_crossing_grows_with_edges_that_are_not_straight(ragged_px, l
     assert found.seen.all()
     assert 0.4 < squares.mean() < 1.4  # below 1 without raggedness, as a prior σ of the profile is kept
     assert np.sqrt(found.covariance_px2[:, 0, 0]).min() > least_sigma_px
-
-
-def test_an_edge_whose_equations_are_singular_leaves_the_others():
-    design = np.random.default_rng(1).normal(size=(2, 3, 4, 2))
-    design[1] = 1e12  # two unknowns that move all pixels alike
-    values, inverse = solved(design, np.ones((2, 3, 4)), np.ones((2, 3, 4)))
-    assert np.isfinite(inverse[0]).all()
-    assert np.isfinite(values[0]).all()
-    assert np.isnan(inverse[1]).all()

@@ -48,7 +48,8 @@ from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import second_design, tag_body
 from tests.outcome import refuses
-from tests.support.circle_images import area_and_centroid
+from tests.shared import written
+from tests.support.areas import area_and_centroid
 
 PER_MM = 4
 """With fewer, the letters beside a plate pass for circles seen from the side."""
@@ -118,8 +119,7 @@ def seen_ways(image, places):
 @pytest.mark.parametrize("target", [reference_target(), second_design()[0]], ids=["bright", "dark"])
 def test_faces_are_read_back(target: TargetDesign, tmp_path):
     """Every page of the PDF, drawn by another program: all circles of its face named, at their places."""
-    (tmp_path / "target.toml").write_text(target_toml(target))
-    drawn = draw(tmp_path / "target.toml", tmp_path / "target.pdf")
+    drawn = draw(written(tmp_path / "target.toml", target_toml(target)), tmp_path / "target.pdf")
     pages = pages_of(drawn.path.read_bytes())
     assert len(pages) == len(target.faces)
     for sheet, page in zip(drawn.sheets, pages, strict=True):
@@ -177,7 +177,11 @@ def test_squares_and_tags_are_read_back(board):
         assert np.linalg.norm(views[BOARD].xy_px - xy[views[BOARD].ids], axis=1).max() < CORNER_PX
 
 
-def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
+def test_plates_have_their_margin_and_circles_and_holes_lie_where_the_design_has_them():
+    for part, face in zip(parts_of(reference_target(), 7.0), reference_target().faces, strict=True):
+        rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]
+        np.testing.assert_allclose(part.outline.min(0), rims.min((0, 1)) - 7.0)
+        np.testing.assert_allclose(part.outline.max(0), rims.max((0, 1)) + 7.0)
     board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark", rings=((0, 1), (3, 2)))
     (part,) = parts_of(board, 10.0)
     discs = [(s.x, -s.y, s.radius, s.ink) for s in part.shapes if s.layer == "PATTERN" and isinstance(s, Disc)]
@@ -185,13 +189,6 @@ def test_asymmetric_circles_and_their_holes_lie_where_the_design_has_them():
     wanted = [*((x, y, 3.0, "black") for x, y in board.xy_mm()), *holes]
     assert [ink for *_, ink in discs] == [ink for *_, ink in wanted]
     np.testing.assert_allclose([numbers for *numbers, _ in discs], [numbers for *numbers, _ in wanted])
-
-
-def test_plates_have_their_margin():
-    for part, face in zip(parts_of(reference_target(), 7.0), reference_target().faces, strict=True):
-        rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]
-        np.testing.assert_allclose(part.outline.min(0), rims.min((0, 1)) - 7.0)
-        np.testing.assert_allclose(part.outline.max(0), rims.max((0, 1)) + 7.0)
 
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -216,15 +213,12 @@ def assert_is_the_target(circles: dict[str, tuple[np.ndarray, float]]):
         np.testing.assert_allclose([circles[label][1] for label in face.labels()], face.radius_mm, atol=DIGITS)
 
 
-def test_a_design_is_drawn_like_its_file(files):
+def test_svg_has_the_target_in_mm_of_a_design_as_of_its_file(files):
     of_file, of_design = files / "of-file.svg", files / "of-design.svg"
     draw(files / "target.toml", of_file)
     assert stcal.draw(stcal.load_target(files / "target.toml"), of_design).path == of_design
     assert of_design.read_bytes() == of_file.read_bytes()
     refuses("E-OPTION-RANGE … -1", stcal.draw, files / "target.toml", of_design, margin_mm=-1.0)
-
-
-def test_svg_has_the_target_in_mm(files):
     drawn = draw(files / "target.toml", files / "target.svg")
     root = ElementTree.parse(drawn.path).getroot()
     width, height = float(root.get("width", "").removesuffix("mm")), float(root.get("height", "").removesuffix("mm"))
@@ -238,13 +232,17 @@ def test_svg_has_the_target_in_mm(files):
 
 
 @pytest.mark.slow
-def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
+def test_pages_of_a_pdf_have_the_size_of_the_paper_and_a_net_is_on_one_sheet(files, target, tmp_path):
     drawn = draw(files / "target.toml", files / "target.pdf", "letter")
     sizes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", drawn.path.read_bytes())
     assert len(sizes) == len(drawn.sheets) == 5
     for sheet, size in zip(drawn.sheets, sizes, strict=True):
         np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
         assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
+    drawn = draw(target, tmp_path / "net.pdf", net=True)  # 400 × 200 mm and more
+    assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
+    refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
+    assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))
 
 
 def test_sheets_cover_the_board_and_seams_run_between_dots():
@@ -342,7 +340,8 @@ def places_of(target, part) -> dict[str, np.ndarray]:
     return found
 
 
-def test_a_box_is_one_net(target):
+def test_a_box_is_one_net_whose_plates_meet_as_they_do_in_space_and_are_read_from_it(target):
+    """At a fold both plates have the same corners."""
     part = net_part(target)
     assert set(circles_of(part)) == set(target.radius_of())
     plates = places_of(target, part)
@@ -357,27 +356,6 @@ def test_a_box_is_one_net(target):
         assert all(end.any() for end in ends)
     lengths = sorted(float(np.linalg.norm(np.diff(line.lines[0], axis=0))) for line in folds)
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_net_is_on_one_sheet(target, tmp_path):
-    """400 × 200 mm and more."""
-    drawn = draw(target, tmp_path / "net.pdf", net=True)
-    assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
-    refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
-    assert "larger than A0" in net_text(tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0))
-
-
-@pytest.mark.parametrize(("width_mm", "paper"), [(30.0, "A4"), (90.0, "A2")])
-def test_a_dodecahedron_is_one_net(width_mm, paper):
-    body = tag_body("dodecahedron", width_mm, "DICT_APRILTAG_36h11", 0)
-    assert net_text(body).endswith(f"one sheet of {paper}")
-
-
-def test_plates_meet_in_the_net_as_they_do_in_space(target):
-    """Folded circles' distances across an edge: at a fold both plates have the same corners."""
-    part = net_part(target)
-    plates = places_of(target, part)
     space = {f.id: f.rough_target_from_face @ np.pad(f.outline_mm, ((0, 0), (0, 1))) for f in target.faces}
     together = 0
     for one, other in combinations(plates, 2):
@@ -386,9 +364,6 @@ def test_plates_meet_in_the_net_as_they_do_in_space(target):
         assert not (flat & ~real).any() or flat.sum() == 1  # two plates may touch at a corner of a third
         together += (flat & real).sum() == 2
     assert together == 4
-
-
-def test_all_faces_are_read_from_the_net(target):
     sheet = one_sheet([net_part(target)], "net")
     image = pages_of(pdf([sheet]))[0]
     found = detect_image(image, camera_of(image), target, None, EllipseOptions())
@@ -396,7 +371,13 @@ def test_all_faces_are_read_from_the_net(target):
     assert all(len(each.circles) == 9 for each in found.faces)
 
 
-def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
+@pytest.mark.parametrize(("width_mm", "paper"), [(30.0, "A4"), (90.0, "A2")])
+def test_a_dodecahedron_is_one_net(width_mm, paper):
+    body = tag_body("dodecahedron", width_mm, "DICT_APRILTAG_36h11", 0)
+    assert net_text(body).endswith(f"one sheet of {paper}")
+
+
+def test_plates_that_run_the_same_way_do_not_share_an_edge_and_what_lacks_an_outline_is_refused(target, tmp_path):
     """Two pages of a book: one would cover the other."""
     outline = [[-50, -50], [150, -50], [150, 150], [-50, 150]]
     pages = []
@@ -406,9 +387,6 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
         pose = Rigid(turn, turn @ [50.0, 0, 0])
         pages.append(replace(reference_target().faces[number], outline_mm=outline, rough_target_from_face=pose))
     refuses("E-DRAW-NET", net_part, TargetDesign("book", "dark", tuple(pages)))
-
-
-def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
     refuses("E-DRAW-NET … --net … 1 … outline_mm", draw, tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
     nowhere = tuple(replace(face, rough_target_from_face=None) for face in target.faces)

@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from tests.commands import CALLS, Call
 from tests.fuzzing.judged import Outcome
-from tests.fuzzing.stock import write_rows
+from tests.shared import write_rows
 
 Edit = Callable[[Path], None]
 SAID = r"(?i)\b(warning|note|failed|suspicious|reject|layout does not have)\b"

@@ -14,11 +14,9 @@ from pathlib import Path
 from stcal.parallel import ONE_THREAD
 from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged, judged, judged_option
-from tests.fuzzing.judged import LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out
-from tests.fuzzing.kept import closed, of_kept
-from tests.fuzzing.kills import killed
+from tests.fuzzing.judged import LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out, unchecked, watched
+from tests.fuzzing.kills import closed, killed, of_kept
 from tests.fuzzing.mistakes import MISTAKES, told
-from tests.fuzzing.writers import unchecked, watched
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
 MOST_MEMORY = 8 << 30

@@ -1,6 +1,5 @@
 """Valid inputs of every command, small, made once; a case copies of them what it spoils."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
 from tests.handeye.photographed import looks, photographs
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
-from tests.shared import own_copy
+from tests.shared import own_copy, write_rows
 from tests.support.arms import elastic
 from tests.support.handeye import simulated
 
@@ -81,14 +80,9 @@ def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None 
     _robots(folder / "robot", rng)
     _held(folder)
     _handeye(folder / "handeye", rng)
-    _tags(folder / "locate", rng)
+    write_tags(folder / "locate", rng)
     _register(folder / "register", rng)
     return folder
-
-
-def write_rows(path: Path, header, rows) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
 
 
 def _of_runs(folder: Path) -> None:
@@ -202,8 +196,9 @@ def _handeye(folder: Path, rng: np.random.Generator) -> None:
     (folder / "boards.toml").write_text(BOARDS)
 
 
-def _tags(folder: Path, rng: np.random.Generator) -> None:
-    """Exposures of a scene with what leads to the robot, and photographs of the target above a board."""
+def write_tags(folder: Path, rng: np.random.Generator, printed: np.ndarray | None = None, count: int = 3) -> None:
+    """Exposures of a scene with what leads to the robot, and photographs of the target above a chessboard; or of
+    another sheet of 220 × 320 mm."""
     (folder / "scenes" / "a").mkdir(parents=True)
     (folder / "images").mkdir()
     image = photo(tilted(30))
@@ -217,8 +212,9 @@ def _tags(folder: Path, rng: np.random.Generator) -> None:
     offset = {"obj_from_goal": Rigid.exp([0, 0, 0, 0, 0, -40]).matrix().tolist()}
     (folder / "offset.json").write_text(json.dumps(offset))
     write_rows(folder / "robot.csv", ["scene", *POSE], [["a", *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]])
-    printed, matrix = _sheet_with_board(), np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
-    for k in range(3):
+    printed = _sheet_with_board() if printed is None else printed
+    matrix = np.array([[1300.0, 0, 599.5], [0, 1300.0, 449.5], [0, 0, 1]])
+    for k in range(count):
         tilt = Rigid.exp([*rng.uniform(-0.4, 0.4, 2), 0, 0, 0, 0]).rotation
         turn = tilt @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
         shift = np.array([0, 0, 620.0]) - turn @ np.array([SHEET_MM[0] / 2, 160.0, 0])

@@ -25,19 +25,13 @@ def rosenbrock(x: np.ndarray) -> NormalEquations:
     return NormalEquations.of(residual, np.array([[-20 * x[0], 10.0], [-1.0, 0.0]]))
 
 
-def test_a_curved_valley_is_followed_to_its_end():
+def test_a_curved_valley_is_followed_to_its_end_also_by_many_problems_at_once():
     found = minimise(np.array([-1.2, 1.0]), rosenbrock, np.add)
     assert found.converged
     assert found.state == pytest.approx([1, 1], abs=1e-6)
     assert 5 < found.steps < 100
-
-
-def test_what_nothing_determines_stays():
     found = minimise(np.array([5.0, 7.0]), lambda x: NormalEquations.of(x[:1] - 2, np.array([[1.0, 0.0]])), np.add)
     assert found.state == pytest.approx([2, 7], abs=1e-6)
-
-
-def test_many_problems_end_where_each_would_alone():
     starts = np.array([[-1.2, 1.0], [2.0, 2.0], [0.0, 0.0]])
 
     def at_once(x):
@@ -52,7 +46,7 @@ def test_many_problems_end_where_each_would_alone():
     assert found.state == pytest.approx(np.ones((3, 2)), abs=1e-6)
 
 
-def test_where_there_is_no_minimum_it_says_so():
+def test_where_there_is_no_minimum_it_says_so_and_an_impossible_state_is_never_taken():
     """The cost falls for ever: e⁻ˣ."""
     found = minimise(
         np.zeros(1), lambda x: NormalEquations.of(1e3 * np.exp(-x), -1e3 * np.exp(-x)[:, None]), np.add, max_steps=5
@@ -61,8 +55,6 @@ def test_where_there_is_no_minimum_it_says_so():
     refuses("E-NO-MINIMUM … fit … 5 … look", found.required, "fit", "look")
     assert found.required("fit", "look", accepted=1e9) is found
 
-
-def test_an_impossible_state_is_never_taken():
     def linearise(x):
         return NormalEquations.impossible(1) if x[0] <= 0.5 else NormalEquations.of(x - 0.1, np.ones((1, 1)))
 
@@ -96,12 +88,19 @@ def test_robust_sigma_is_sigma_of_normal_errors(coordinates):
     assert 0.04 < beyond < 0.10
 
 
-def test_hubers_loss_and_its_weight_belong_together():
+def test_hubers_loss_and_its_weight_belong_together_and_rows_have_the_scale_that_each_has_alone():
     length = np.linspace(0.1, 9, 50)
     slope = (huber_cost(length + 1e-6, 3.0) - huber_cost(length - 1e-6, 3.0)) / 2e-6
     assert slope == pytest.approx(2 * huber_weights(length, 3.0) * length, rel=1e-6)
     assert (huber_weights(length, np.inf) == 1).all()
     assert huber_cost(length, np.inf) == pytest.approx(length**2)
+    rng = np.random.default_rng(1)
+    length, among = np.abs(rng.standard_normal((40, 31))), rng.random((40, 31)) < 0.6
+    among[3], among[4] = False, np.arange(31) == 7
+    found = robust_sigmas(length, among)
+    assert np.isnan(found[3])
+    for k in (i for i in range(40) if i != 3):
+        assert found[k] == pytest.approx(robust_sigma(length[k, among[k]]), rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8])
@@ -110,16 +109,6 @@ def test_the_middle_of_few_lengths(count):
     lengths = np.random.default_rng(count).permutation(np.arange(1.0, count + 1))
     assert robust_sigma(lengths) * 0.6744897501960817 == pytest.approx((count + 1) / 2, rel=1e-12)
     assert np.isnan(robust_sigma(np.append(lengths, np.nan)))
-
-
-def test_rows_have_the_scale_that_each_has_alone():
-    rng = np.random.default_rng(1)
-    length, among = np.abs(rng.standard_normal((40, 31))), rng.random((40, 31)) < 0.6
-    among[3], among[4] = False, np.arange(31) == 7
-    found = robust_sigmas(length, among)
-    assert np.isnan(found[3])
-    for k in (i for i in range(40) if i != 3):
-        assert found[k] == pytest.approx(robust_sigma(length[k, among[k]]), rel=1e-12)
 
 
 @pytest.mark.parametrize("redundancy", [2.0, 7.5, 300.0, 1e9])
@@ -154,14 +143,11 @@ def test_sigma_by_clusters_hold_with_and_without_common_errors(common, formal):
         assert 1 <= np.mean(larger) < 1.12
 
 
-def test_the_covariance_is_never_below_that_of_independent_errors():
+def test_the_covariance_is_never_below_that_of_independent_errors_and_enormous_where_nothing_is_determined():
     rng = np.random.default_rng(2)
     for _ in range(50):
         _, found, independent = drawn(rng, 5, 0.0)
         assert np.linalg.eigvalsh(found.covariance - independent).min() > -1e-12 * np.trace(independent)
-
-
-def test_what_nothing_determines_has_an_enormous_sigma():
     information = np.zeros((5, 3, 3))
     information[:, :2, :2] = np.eye(2)
     pull = np.random.default_rng(4).standard_normal((5, 3)) * [1, 1, 0]

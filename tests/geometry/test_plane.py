@@ -55,7 +55,7 @@ def view(pose: Rigid, xy: np.ndarray) -> np.ndarray:
 
 
 @given(poses)
-def test_fit_plane_finds_the_plane(pose):
+def test_fit_plane_finds_the_plane_and_the_jacobian_of_a_homography_is_the_derivative(pose):
     xyz = pose @ on_plane(GRID)
     normal = pose.rotation[:, 2]
     for side in (1, -1):
@@ -64,9 +64,18 @@ def test_fit_plane_finds_the_plane(pose):
         assert plane.offset == pytest.approx(side * normal @ pose.translation, abs=1e-9)  # lengths of 1e3 mm
         assert plane.rms < 1e-10
         np.testing.assert_allclose((xyz + 3 * normal) @ plane.normal - plane.offset, side * 3, atol=1e-9)
+    h = np.column_stack([pose.rotation[:, :2], pose.translation])
+    step = 1e-3
+    jac = homography_jacobian(h, GRID)
+    for axis in range(2):
+        d = np.zeros(2)
+        d[axis] = step
+        numeric = (apply_homography(h, GRID + d) - apply_homography(h, GRID - d)) / (2 * step)
+        # Entries are about 1/z = 1e-3; central differences err by rounding, 1e-16 / 1e-3.
+        np.testing.assert_allclose(jac[:, :, axis], numeric, atol=1e-11)
 
 
-def test_plane_rms_is_the_spread_about_it():
+def test_plane_rms_is_the_spread_about_it_and_the_offset_that_of_the_field_notes():
     rng = np.random.default_rng(0)
     xyz = on_plane(rng.uniform(-100, 100, (4000, 2)))
     xyz[:, 2] = rng.normal(5, 0.1, 4000)
@@ -75,6 +84,9 @@ def test_plane_rms_is_the_spread_about_it():
     assert plane.rms == pytest.approx(0.1, rel=0.05)
     assert plane.rms == pytest.approx(np.sqrt(((xyz @ plane.normal - plane.offset) ** 2).mean()), rel=1e-9)
     assert plane.offset == pytest.approx(5, abs=0.008)
+    # 1 m, f = 5580 px, r = 8 mm, 45°: 0.18 px (FIELD_NOTES.md).
+    xyz = circle_image_offset([0, 0, 1000.0], np.array([np.sqrt(0.5), 0, -np.sqrt(0.5)]), 8.0)
+    assert np.hypot(*(5580 * xyz[:2] / xyz[2])) == pytest.approx(0.18, abs=0.005)
 
 
 @given(poses, st.sampled_from([4, 5, 20]))
@@ -89,7 +101,7 @@ def test_homography_comes_back_from_its_points(pose, n):
     assert np.linalg.norm(found) == pytest.approx(1, rel=1e-12)
 
 
-def test_homographies_side_by_side_are_those_of_single_ones():
+def test_homographies_side_by_side_are_those_of_single_ones_and_of_opencv():
     """Of points with noise, of which each set uses others; and one set that determines none."""
     rng = np.random.default_rng(4)
     used = rng.random((6, len(GRID))) < 0.6
@@ -105,9 +117,6 @@ def test_homographies_side_by_side_are_those_of_single_ones():
         np.testing.assert_allclose(mapped[k], apply_homography(alone, GRID), rtol=1e-9)
         np.testing.assert_allclose(jacobian[k], homography_jacobian(alone, GRID), rtol=1e-9)
     assert np.isnan(together[5]).all()
-
-
-def test_homography_of_noisy_points_agrees_with_opencv():
     rng = np.random.default_rng(3)
     xy_a = view(Rigid.exp([0.4, -0.3, 0.2, -50, -30, 800]), GRID) * 4000 + rng.normal(0, 0.3, GRID.shape)
     ours = apply_homography(fit_homography(GRID, xy_a), GRID)
@@ -116,19 +125,6 @@ def test_homography_of_noisy_points_agrees_with_opencv():
     assert 0 < np.abs(ours - opencv).max() < 0.02
     rms = np.sqrt(((ours - xy_a) ** 2).mean())
     assert rms == pytest.approx(0.3 * np.sqrt(1 - 8 / 40), rel=0.3)  # 40 equations, 8 unknowns, 12 % standard error
-
-
-@given(poses)
-def test_homography_jacobian_is_the_derivative(pose):
-    h = np.column_stack([pose.rotation[:, :2], pose.translation])
-    step = 1e-3
-    jac = homography_jacobian(h, GRID)
-    for axis in range(2):
-        d = np.zeros(2)
-        d[axis] = step
-        numeric = (apply_homography(h, GRID + d) - apply_homography(h, GRID - d)) / (2 * step)
-        # Entries are about 1/z = 1e-3; central differences err by rounding, 1e-16 / 1e-3.
-        np.testing.assert_allclose(jac[:, :, axis], numeric, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +161,7 @@ def test_refinement_recovers_the_pose_from_a_poor_start(pose, turn, move):
     np.testing.assert_allclose(found.translation, pose.translation, atol=1e-5)
 
 
-def test_refinement_agrees_with_opencv_on_noisy_points():
+def test_refinement_agrees_with_opencv_on_noisy_points_and_refuses_those_behind_the_camera(monkeypatch):
     rng = np.random.default_rng(1)
     pose = Rigid.exp([0.5, 0.3, -0.2, -40, -30, 900])
     seen = view(pose, GRID) + rng.normal(0, 1e-4, GRID.shape)
@@ -177,9 +173,6 @@ def test_refinement_agrees_with_opencv_on_noisy_points():
     # Both minimise the same sum of squares; OpenCV's LM stops some 1e-6 from the minimum.
     np.testing.assert_allclose(ours.log(), np.concatenate([rvec, tvec]).ravel(), rtol=1e-5, atol=1e-6)
     assert np.abs(ours.translation - pose.translation).max() > 1e-3  # the noise did move it
-
-
-def test_refinement_refuses_points_behind_the_camera_and_poses_that_do_not_settle(monkeypatch):
     refuses("E-POINTS-BEHIND", refine_planar_pose, Rigid(translation=[0, 0, -500]), GRID, GRID / 1000)
     monkeypatch.setattr("stcal.geometry.plane.MAX_STEPS", 1)
     refuses("E-NO-MINIMUM … planar pose … 1", refine_planar_pose, Rigid(translation=[0, 0, 600]), GRID, GRID / 500)
@@ -223,12 +216,6 @@ def test_offset_point_projects_to_the_centre_of_the_fitted_ellipse(circle):
     np.testing.assert_array_equal(circle_image_offset(centre, -normal, radius), xyz)
 
 
-def test_offset_of_the_field_notes():
-    # 1 m, f = 5580 px, r = 8 mm, 45°: 0.18 px (FIELD_NOTES.md).
-    xyz = circle_image_offset([0, 0, 1000.0], np.array([np.sqrt(0.5), 0, -np.sqrt(0.5)]), 8.0)
-    assert np.hypot(*(5580 * xyz[:2] / xyz[2])) == pytest.approx(0.18, abs=0.005)
-
-
 def tilted_plane(seed: int):
     rng = np.random.default_rng(seed)
     while True:
@@ -246,11 +233,8 @@ def tilted_plane(seed: int):
 def test_one_of_the_poses_is_the_true_one_and_both_are_opencvs(seed):
     xy, seen, pose, cosine = tilted_plane(seed)
     found = poses_of_plane(xy, seen)
-    off = [
-        max(np.abs(p.rotation - pose.rotation).max(), np.abs(p.translation - pose.translation).max())
-        for p in found.poses
-    ]
-    assert min(off) < 1e-8  # rounding, over the condition of the homography
+    off = min(np.abs(each.matrix() - pose.matrix()).max() for each in found.poses)
+    assert off < 1e-8  # rounding, over the condition of the homography
     assert found.foreshortening == pytest.approx(cosine, abs=1e-9)
     _, turns, _, _ = cv2.solvePnPGeneric(np.pad(xy, ((0, 0), (0, 1))), seen, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     theirs = [cv2.Rodrigues(turn)[0] for turn in turns]
@@ -258,15 +242,11 @@ def test_one_of_the_poses_is_the_true_one_and_both_are_opencvs(seed):
         assert min(np.abs(ours.rotation - each).max() for each in theirs) < 1e-9
 
 
-def test_size_and_distance_change_det_j_but_not_the_foreshortening():
+def test_size_and_distance_change_det_j_but_not_the_foreshortening_and_from_behind_is_refused():
     xy, seen, _, _ = tilted_plane(3)
     one, ten = poses_of_plane(xy, seen), poses_of_plane(10 * xy, seen)
     assert ten.foreshortening == pytest.approx(one.foreshortening, rel=1e-9)
     assert ten.determinant == pytest.approx(one.determinant / 100, rel=1e-9)
-
-
-def test_from_behind_is_refused():
-    xy, seen, _, _ = tilted_plane(0)
     refuses("E-POINTS-MIRRORED", poses_of_plane, xy * [-1, 1], seen)
 
 
@@ -291,7 +271,7 @@ def evaluate(poses, huber=3.0):
     return Normal.of((MEASURED - xy) / 0.01, by_pose / 0.01, possible, huber)
 
 
-def test_every_start_reaches_its_minimum():
+def test_every_start_reaches_its_minimum_and_a_pose_with_points_behind_the_camera_is_none():
     """To σ: 12 points, 24 − 6 degrees of freedom, χ² below 45 but for one in 2000; starts off by up to 17°, 30 mm."""
     far = [Rigid.exp([*RNG.normal(0, 0.1, 3), *RNG.normal(0, 10, 3)]) @ TRUTH for _ in range(5)]
     found = descend(evaluate, Poses.of(far), 1e-8)
@@ -300,6 +280,10 @@ def test_every_start_reaches_its_minimum():
     assert np.ptp(found.poses.translation, axis=0) == pytest.approx(0, abs=1e-4)
     sigma = np.sqrt(np.diag(np.linalg.inv(found.normal[0])))[3:]
     assert (np.abs(found.poses.translation[0] - TRUTH.translation) < 4 * sigma).all()
+    assert evaluate(Poses.of([Rigid.exp([0, 0, 0, 0, 0, -400])])).cost[0] == np.inf
+    blocks = RNG.normal(size=(2, 4, 2, 3))
+    assert np.array_equal(block_diagonal(blocks[0]), block_diag(*blocks[0]))
+    assert np.array_equal(block_diagonal(blocks)[1], block_diag(*blocks[1]))
 
 
 def test_hopeless_rivals_are_left():
@@ -318,16 +302,6 @@ def test_hopeless_rivals_are_left():
     left = descend(evaluate, start, 1e-9, hopeless=500.0).poses.translation[:, 0]
     assert followed[1] > 8
     assert left.tolist() == [0, 0]
-
-
-def test_a_pose_with_points_behind_the_camera_is_no_minimum():
-    assert evaluate(Poses.of([Rigid.exp([0, 0, 0, 0, 0, -400])])).cost[0] == np.inf
-
-
-def test_block_diagonal():
-    blocks = RNG.normal(size=(2, 4, 2, 3))
-    assert np.array_equal(block_diagonal(blocks[0]), block_diag(*blocks[0]))
-    assert np.array_equal(block_diagonal(blocks)[1], block_diag(*blocks[1]))
 
 
 DOTS = np.array([[x, y, 0.0] for x in (-30, -10, 10, 30) for y in (-20, 0, 20)])
@@ -371,31 +345,11 @@ def test_both_minima_are_found_from_either(side):
     assert np.linalg.norm(second[:3]) < 0.1
 
 
-def test_a_near_plane_has_one():
+def test_a_near_plane_has_one_and_a_descent_that_does_not_settle_raises():
     """25° at 100 mm, where perspective decides: one minimum, or a second one that is far worse."""
     cost = minima(tilted(0.44, 100.0), tilted(0.44, 100.0))[0].cost
     assert len(cost) == 1 or cost[1] > cost[0] + 1e4
 
-
-def test_minima_are_told_apart_by_the_residuals_own_sigma():
-    """Residuals ten times what is stated: what is two by the stated σ is one by what the residuals say."""
-    normal = np.diag([1e6] * 3 + [1.0] * 3)
-    poses = Poses.of([Rigid.exp([0, 0, 0, 0, 0, 500.0]), Rigid.exp([0.005, 0, 0, 0, 0, 500.0])])  # 5 σ
-    assert distinct(poses, normal)
-    assert not distinct(poses, normal, robust_sigma=10.0)
-    limit = minima(tilted(0.44, 2000.0), tilted(0.44, 2000.0), factor=10.0)[1]
-    assert 5 * OUTLIER < limit < 20 * OUTLIER
-
-
-def test_mirrored_twice_is_where_it_was():
-    poses = Poses.of([tilted(0.3, 700.0), tilted(-0.2, 300.0)])
-    plane = Rigid.exp([0.1, 0.2, 0.3, 5.0, 6.0, 7.0])
-    twice = mirrored(mirrored(poses, plane), plane)
-    assert twice.rotation == pytest.approx(poses.rotation, abs=1e-12)
-    assert twice.translation == pytest.approx(poses.translation, abs=1e-9)
-
-
-def test_a_descent_that_does_not_settle_raises():
     def unsettled(poses, huber):
         found = descend_to(measured(tilted(0.1, 500.0)), poses, huber)
         return replace(found, settled=np.zeros(len(poses), bool))
@@ -403,17 +357,15 @@ def test_a_descent_that_does_not_settle_raises():
     refuses("E-NO-MINIMUM", two_minima, lambda _: unsettled, Poses.of([tilted(0.1, 500.0)]), MIDDLE, "no pose at all")
 
 
-def test_odds():
-    """Even odds put half a squared distance on the covariance; one in 10⁶ needs Δχ² 27.6, of residuals as stated."""
-    away = np.array([0.1, 0, 0, 2.0, 0, 0])
-    assert covariance_of_both(np.eye(6), away, 0.0) == pytest.approx(np.eye(6) + np.outer(away, away) / 2)
-    assert covariance_of_both(np.eye(6), away, np.inf) == pytest.approx(np.eye(6))
-    assert deciding_delta(1e-6, 1.0, 0.5) == pytest.approx(27.63, abs=0.01)
-    assert deciding_delta(1e-6, 1.5, 4.0) == pytest.approx(4 * 27.63, abs=0.01)
-
-
-def test_weighed_by_what_is_common():
-    """A shift that all points share weighs nothing once it is in their covariance: χ² is of what is left of 2n − 6."""
+def test_minima_are_told_apart_by_the_residuals_own_sigma_and_by_what_is_common():
+    """Residuals ten times what is stated: what is two by the stated σ is one by what the residuals say. A shift that
+    all points share weighs nothing once it is in their covariance: χ² is of what is left of 2n − 6."""
+    normal = np.diag([1e6] * 3 + [1.0] * 3)
+    poses = Poses.of([Rigid.exp([0, 0, 0, 0, 0, 500.0]), Rigid.exp([0.005, 0, 0, 0, 0, 500.0])])  # 5 σ
+    assert distinct(poses, normal)
+    assert not distinct(poses, normal, robust_sigma=10.0)
+    limit = minima(tilted(0.44, 2000.0), tilted(0.44, 2000.0), factor=10.0)[1]
+    assert 5 * OUTLIER < limit < 20 * OUTLIER
     truth = tilted(0.44, 400.0)
     shifted = measured(truth) + 50 * SIGMA
     n = len(DOTS)
@@ -427,3 +379,17 @@ def test_weighed_by_what_is_common():
     assert step @ found.normal[0] @ step < 1e-12
     assert 5 < found.chi2[0] < 45  # χ² of 18: once in 2000 on either side
     assert found.residual.shape == (1, n, 2)
+
+
+def test_mirrored_twice_is_where_it_was_and_odds_decide():
+    """Even odds put half a squared distance on the covariance; one in 10⁶ needs Δχ² 27.6, of residuals as stated."""
+    poses = Poses.of([tilted(0.3, 700.0), tilted(-0.2, 300.0)])
+    plane = Rigid.exp([0.1, 0.2, 0.3, 5.0, 6.0, 7.0])
+    twice = mirrored(mirrored(poses, plane), plane)
+    assert twice.rotation == pytest.approx(poses.rotation, abs=1e-12)
+    assert twice.translation == pytest.approx(poses.translation, abs=1e-9)
+    away = np.array([0.1, 0, 0, 2.0, 0, 0])
+    assert covariance_of_both(np.eye(6), away, 0.0) == pytest.approx(np.eye(6) + np.outer(away, away) / 2)
+    assert covariance_of_both(np.eye(6), away, np.inf) == pytest.approx(np.eye(6))
+    assert deciding_delta(1e-6, 1.0, 0.5) == pytest.approx(27.63, abs=0.01)
+    assert deciding_delta(1e-6, 1.5, 4.0) == pytest.approx(4 * 27.63, abs=0.01)

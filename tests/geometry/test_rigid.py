@@ -1,4 +1,5 @@
-"""Transforms: group axioms, points, covariances of chains, alignment, and what is refused."""
+"""Transforms: group axioms, points, covariances of chains, alignment, and what is refused. Covariances: rounding
+passes, all that cannot be one is named with what was measured."""
 
 from dataclasses import replace
 
@@ -9,8 +10,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from stcal.geometry.arrays import OF_POSE, ROUNDING, CovarianceRows, first_fault, require_covariance
 from stcal.geometry.rigid import Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
-from tests.outcome import refuses
+from stcal.io.json import Part, PoseCovariance, checked
+from tests.outcome import fails_with, refuses
 
 TOLERANCE_MM = 1e-9
 """Rounding: three products of coordinates below 1e4 mm lose about 1e4 · 1e-16 · 10 = 1e-11 mm."""
@@ -69,34 +72,16 @@ def test_exp_and_log_are_inverse_below_half_a_turn(w, t):
 
 @given(rigids)
 def test_matrix_round_trip(a_from_b):
-    assert_same(Rigid.from_matrix(a_from_b.matrix()), a_from_b)
-    assert_same(Rigid.from_matrix(a_from_b.matrix()[:3]), a_from_b)
+    for matrix in (a_from_b.matrix(), a_from_b.matrix()[:3]):
+        assert_same(Rigid.from_matrix(matrix), a_from_b)
 
 
-def test_quarter_turn_about_z_by_hand():
+def test_quarter_turn_by_hand_and_fields_are_read_only_copies():
     a_from_b = Rigid.exp([0, 0, np.pi / 2, 10, 20, 30])
     np.testing.assert_allclose(a_from_b @ [1.0, 0, 0], [10, 21, 30], atol=1e-14)
     np.testing.assert_allclose(a_from_b.inverse() @ [10, 21, 30], [1, 0, 0], atol=1e-14)
     assert (a_from_b @ np.zeros((4, 5, 3))).shape == (4, 5, 3)
     np.testing.assert_allclose(Similarity(2.0, a_from_b) @ [1.0, 0, 0], [10, 22, 30], atol=1e-14)
-
-
-@given(vectors, vectors)
-def test_skew_is_the_cross_product(v, w):
-    np.testing.assert_allclose(skew(np.array([[v, w]])) @ w, [[np.cross(v, w), np.zeros(3)]], atol=1e-9)  # up to 1e6
-    np.testing.assert_array_equal(skew(v), -skew(v).T)
-
-
-def test_products_of_accepted_rotations_are_accepted():
-    # Seven printed digits: each factor passes the 1e-6 check; unprojected, the third product would not.
-    rotation = np.eye(3) * (1 + 4e-7)
-    product = Rigid(rotation)
-    for _ in range(10):
-        product = product @ Rigid(rotation)
-    np.testing.assert_allclose(product.rotation @ product.rotation.T, np.eye(3), atol=1e-12)
-
-
-def test_fields_are_read_only_copies():
     rotation = np.eye(3)
     a_from_b = Rigid(rotation)
     rotation[0, 0] = 5
@@ -105,6 +90,26 @@ def test_fields_are_read_only_copies():
         a_from_b.translation[0] = 1
     with pytest.raises(AttributeError):
         a_from_b.translation = np.ones(3)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(v, w):
+    np.testing.assert_allclose(skew(np.array([[v, w]])) @ w, [[np.cross(v, w), np.zeros(3)]], atol=1e-9)  # up to 1e6
+    np.testing.assert_array_equal(skew(v), -skew(v).T)
+
+
+def test_products_of_accepted_rotations_are_accepted_and_the_rounding_of_a_text_file_repaired():
+    # Seven printed digits: each factor passes the 1e-6 check; unprojected, the third product would not.
+    rotation = np.eye(3) * (1 + 4e-7)
+    product = Rigid(rotation)
+    for _ in range(10):
+        product = product @ Rigid(rotation)
+    np.testing.assert_allclose(product.rotation @ product.rotation.T, np.eye(3), atol=1e-12)
+    exact = Rigid.exp([0.3, -0.2, 0.9, 1, 2, 3])
+    repaired = Rigid.from_matrix(np.round(exact.matrix(), 4))
+    error = np.abs(repaired.rotation - exact.rotation).max()
+    assert 0 < error < 1e-4  # four decimals were lost, and no more than that comes back
+    np.testing.assert_allclose(repaired.rotation @ repaired.rotation.T, np.eye(3), atol=1e-14)
 
 
 def _changed(row, column, value):
@@ -137,14 +142,6 @@ def test_what_is_no_transform_is_refused(make, given, message):
     refuses(message, make, *given)
 
 
-def test_from_matrix_repairs_the_rounding_of_a_text_file():
-    exact = Rigid.exp([0.3, -0.2, 0.9, 1, 2, 3])
-    repaired = Rigid.from_matrix(np.round(exact.matrix(), 4))
-    error = np.abs(repaired.rotation - exact.rotation).max()
-    assert 0 < error < 1e-4  # four decimals were lost, and no more than that comes back
-    np.testing.assert_allclose(repaired.rotation @ repaired.rotation.T, np.eye(3), atol=1e-14)
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.3, 2.0, np.pi - 1e-3])
 def test_sigma_of_a_rotation_vector_are_those_of_its_components(angle):
     rng = np.random.default_rng(3)
@@ -152,11 +149,8 @@ def test_sigma_of_a_rotation_vector_are_those_of_its_components(angle):
     pose = Rigid.exp([*(angle * axis / np.linalg.norm(axis)), 1.0, 2.0, 3.0])
     root = rng.normal(size=(6, 6)) * 1e-3
     step = 1e-6
-    slope = (
-        np.array([(Rigid.exp(step * e) @ replace(pose, translation=np.zeros(3))).log()[:3] for e in np.eye(6)[:3]])
-        - pose.log()[:3]
-    )
-    jacobian = slope.T / step
+    turned = [Rigid.exp(step * e) @ replace(pose, translation=np.zeros(3)) for e in np.eye(6)[:3]]
+    jacobian = (np.array([each.log()[:3] for each in turned]) - pose.log()[:3]).T / step
     expected = np.sqrt(np.diag(jacobian @ (root @ root.T)[:3, :3] @ jacobian.T))
     np.testing.assert_allclose(pose.log_sigma(root @ root.T)[:3], expected, rtol=1e-4)
     np.testing.assert_allclose(pose.log_sigma(root @ root.T)[3:], np.sqrt(np.diag(root @ root.T)[3:]))
@@ -166,7 +160,7 @@ def drawn(pose: UncertainRigid, count: int, rng) -> Poses:
     return Poses.of([pose.rigid] * count).moved(rng.multivariate_normal(np.zeros(6), pose.covariance, count))
 
 
-def test_the_covariance_of_a_product_is_that_of_drawn_products():
+def test_the_covariance_of_a_product_is_that_of_drawn_products_and_exact_poses_stay_exact():
     rng = np.random.default_rng(1)
     parts = []
     for _ in range(3):
@@ -184,15 +178,9 @@ def test_the_covariance_of_a_product_is_that_of_drawn_products():
     # σ of a variance from n draws is √(2/n): 1 %; the largest of 21 stays below five of them.
     assert np.abs((seen - chain.covariance) / scale).max() < 0.05
     assert np.abs((np.diag(seen) / np.diag(chain.covariance)) - 1).max() < 0.05
-
-
-def test_a_difference_is_the_motion_in_frame_a():
     step, pose = np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]), Rigid.exp([0.4, 0.5, -0.6, 7, 8, 9])
     moved = Rigid(Rigid.exp([*step[:3], 0, 0, 0]).rotation @ pose.rotation, pose.translation + step[3:])
     np.testing.assert_allclose(moved.difference(pose), step, atol=1e-12)
-
-
-def test_exact_poses_stay_exact():
     one = UncertainRigid.exact(Rigid(np.eye(3), [1.0, 2.0, 3.0]))
     assert ((one @ one).covariance == 0).all()
     assert (one @ one).rigid.translation.tolist() == [2.0, 4.0, 6.0]
@@ -234,7 +222,7 @@ def test_weights_of_zero_and_copies_count_as_absent_and_double(seed):
     np.testing.assert_allclose(align_rigid(xyz_a, xyz_b, [0, 1, 1, 1, 1]).matrix(), without.matrix(), atol=1e-8)
 
 
-def test_similarity_is_the_minimum_that_a_general_optimiser_finds():
+def test_similarity_is_the_minimum_that_a_general_optimiser_finds_and_no_reflection():
     rng = np.random.default_rng(5)
     xyz_b, weights = cloud(5, 7), rng.uniform(0.5, 2, 7)
     xyz_a = Similarity(1.7, random_rigid(5)) @ xyz_b + rng.normal(0, 5, (7, 3))
@@ -246,9 +234,6 @@ def test_similarity_is_the_minimum_that_a_general_optimiser_finds():
 
     best = minimize(cost, np.full(7, 0.01), method="BFGS", options={"gtol": 1e-6})
     assert cost(np.zeros(7)) == pytest.approx(best.fun, rel=1e-9)  # neither may be lower than the other
-
-
-def test_mirrored_points_give_a_rotation_not_a_reflection():
     xyz_b = cloud(2)
     mirrored = xyz_b * [1, 1, -1]
     found = align_rigid(mirrored, xyz_b)
@@ -279,3 +264,90 @@ OFF_ZERO = LINE + np.array([1000.0, 0, 0])  # a line that misses the origin
 )
 def test_degenerate(align, xyz_a, xyz_b, weights, message):
     refuses(message, align, xyz_a, xyz_b, weights)
+
+
+SIGMA = np.array([1e-5, 2e-5, 3e-5, 0.01, 0.02, 500.0])
+"""rad and mm: sixteen orders of magnitude between variances."""
+
+
+def with_entry(i: int, j: int, correlation: float, both: bool = True) -> np.ndarray:
+    matrix = np.diag(SIGMA**2)
+    matrix[i, j] += correlation * SIGMA[i] * SIGMA[j] - (i == j) * matrix[i, j]
+    if both:
+        matrix[j, i] = matrix[i, j]
+    return matrix
+
+
+def without_a_reason_in_pairs() -> np.ndarray:
+    """Three correlations of −0.6 are possible alone, but not together: eigenvalue 1 − 2 · 0.6."""
+    correlation = np.eye(6)
+    correlation[:3, :3] -= 0.6 * (1 - np.eye(3))
+    return correlation * np.outer(SIGMA, SIGMA)
+
+
+def without_variance() -> np.ndarray:
+    matrix = with_entry(3, 4, 0.5)
+    matrix[3, 3] = 0
+    return matrix
+
+
+NONE = {
+    "negative variance": (with_entry(3, 3, -3.0), "E-COVARIANCE-VALUE … -0.0003 … 0"),
+    "correlation of 9": (with_entry(3, 4, 9.0), "E-COVARIANCE-VALUE … -8 … 0"),
+    "correlation over 1": (with_entry(0, 5, -1.01), "E-COVARIANCE-VALUE … -0.01 … 0"),
+    "not symmetric": (with_entry(0, 1, 0.5) + with_entry(0, 1, 0.06, both=False), "E-COVARIANCE-VALUE … 10.7"),
+    "one side only": (with_entry(4, 2, 0.5, both=False), "E-COVARIANCE-VALUE … 100"),
+    "not together": (without_a_reason_in_pairs(), "E-COVARIANCE-VALUE … -0.2 … 0"),
+    "covariance without variance": (without_variance(), "E-COVARIANCE-VALUE … eigenvalue … 0"),
+    "NaN": (with_entry(1, 1, np.nan), "E-COVARIANCE-VALUE"),
+    "infinite": (with_entry(1, 1, np.inf), "E-COVARIANCE-VALUE"),
+    "too large": (with_entry(5, 5, 1e300), "E-COVARIANCE-VALUE … 2.5 … 305 … 1 … 24"),
+    "5×5": (np.eye(5), "E-COVARIANCE-SHAPE … 5×5 … 6 … 6"),
+    "a row": (np.ones(6), "E-COVARIANCE-SHAPE … 6 … 6 … 6"),
+}
+
+
+@pytest.mark.parametrize("case", NONE)
+def test_what_is_none_is_named(case):
+    matrix, message = NONE[case]
+    refuses(message, require_covariance, matrix, 6, OF_POSE)
+
+
+def test_files_name_the_place_and_not_the_numbers():
+    class Read(Part):
+        faces: dict[str, PoseCovariance]
+
+    with fails_with("E-KEY-VALUE … 2"):
+        checked({"faces": {"1": np.eye(6).tolist(), "2": NONE["not together"][0].tolist()}}, Read)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(6, 12))
+def test_all_ranks_pass_with_six_digits(seed, rank, size):
+    """Singular ones too, as a covariance in the target's own frame is."""
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, rank)) * 10.0 ** rng.uniform(-6, 2, size)[:, None]
+    full = root @ root.T
+    written = np.vectorize(lambda v: float(f"{v:.6g}"))(full)
+    require_covariance((written + written.T) / 2, size, CovarianceRows(tuple("abcdefghijkl")))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rounding_of_zero_passes(seed):
+    """That of the reference face is computed as 1e-69 to 1e-20 of any sign."""
+    noise = np.random.default_rng(seed).standard_normal((6, 6)) * 1e-20
+    require_covariance(noise, 6, OF_POSE)
+
+
+def test_just_beyond_rounding_and_singular_where_it_is_inverted():
+    low, high = (with_entry(0, 1, 1 + share * 6 * ROUNDING) for share in (0.5, 1.5))
+    require_covariance(low, 6, OF_POSE)
+    refuses("E-COVARIANCE-VALUE … -9e-05", require_covariance, high, 6, OF_POSE)
+    stack = np.tile(np.diag(SIGMA**2), (5, 1, 1))
+    assert first_fault(stack, OF_POSE, definite=True) is None
+    stack[2, 5, 5] = stack[4, 5, 5] = 0
+    assert first_fault(stack, OF_POSE) is None
+    fault = first_fault(stack, OF_POSE, definite=True)
+    assert fault is not None
+    assert fault.row == 2
+    assert fault.reason == "variance 0 of z, a positive number needed (and 1 more)"
+    assert first_fault(stack[:0], OF_POSE, definite=True) is None

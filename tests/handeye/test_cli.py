@@ -214,7 +214,7 @@ def test_options_that_cannot_be_are_refused(command, tmp_path, monkeypatch, word
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_the_order_of_quaternions_is_an_option(command, tmp_path):
+def test_the_order_of_quaternions_is_an_option_and_evolution_begins_where_it_is_told(command, tmp_path):
     def roll(rows):
         for row in rows:
             row[3:7], row[10:14] = [*row[4:7], row[3]], [*row[11:14], row[10]]
@@ -226,9 +226,6 @@ def test_the_order_of_quaternions_is_an_option(command, tmp_path):
     code, _, err = command(path, "--splits", 0, "--quaternions", "xyzw", "--out", out)
     assert code == 0, err
     assert in_sigmas(json.loads(out.read_text()), "flange_from_camera", truth.mount_from_camera) < 5
-
-
-def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
     truth = simulated(np.random.default_rng(3), 12, **NOISE)
     path, out = poses_file(tmp_path / "poses.csv", truth), tmp_path / "found.json"
     words = ("--method", "de", "--splits", 0, "--out", out, "--overwrite")

@@ -32,8 +32,8 @@ from tests.handeye.photographed import (
     take,
 )
 from tests.handeye.test_cli import CHANCE, EXACT, in_sigmas
-from tests.outcome import fails_with
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.outcome import fails_with, refuses
+from tests.support.areas import circle_conic, ellipse_of_conic
 from tests.support.handeye import FLANGE_FROM_CAMERA
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
@@ -95,7 +95,7 @@ def test_a_board_is_found_where_it_was_drawn(drawn, tmp_path):
     assert found.symmetries == ()
 
 
-def test_images_of_centres_are_exact():
+def test_images_of_centres_are_exact_and_those_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     """Against the conics of circles seen aslant from near: their centres are off by a tenth of a pixel."""
     board = dots(corner=(0, 0))
     xyz = np.column_stack([board.xy_mm(), np.zeros(len(board.xy_mm()))])
@@ -108,6 +108,11 @@ def test_images_of_centres_are_exact():
     assert np.linalg.norm(seen - true, axis=1).max() > 0.1
     found = images_of_centres(seen, xyz, board.radii_mm(), CAMERA)
     assert np.linalg.norm(found - true, axis=1).max() < 1e-5
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
+    refuses("E-CAMERA-CENTRE … 406 … 293 … a.png", detect_boards, find_images(tmp_path)[0], MODEL, dots(), workers=1)
+    (tmp_path / "a.png").write_bytes(b"")
+    with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
+        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
 
 
 @pytest.mark.parametrize(
@@ -140,15 +145,6 @@ def test_a_board_that_looks_the_same_after_half_a_turn_is_numbered_up_to_it(tmp_
         for turn in (Rigid(), *found.symmetries)
     ]
     assert min(errors) < CORNER_PX < 20 < max(errors)
-
-
-def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
-    with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
-        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
-    (tmp_path / "a.png").write_bytes(b"")
-    with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
-        detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
 
 
 COMMON_FROM_GRID = Rigid(Rotation.from_euler("y", 30, degrees=True).as_matrix(), [-165, 105, 30])

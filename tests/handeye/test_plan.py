@@ -16,7 +16,7 @@ from stcal.robot.kinematics.robot_file import save_robot
 from stcal.robot.kinematics.robot_model import mh80
 from tests.handeye.test_cli import NOISE
 from tests.handeye.written import poses_file
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.support.handeye import CAMERA, board_corners, disturbed, handeye, simulated, squared
 
 ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
@@ -81,10 +81,8 @@ def test_only_what_the_robot_reaches_is_planned():
     assert (planned.base_from_flange.translation[:, 2] > height).all()
     with fails_with("E-PLAN-OUT-OF-REACH"):
         plan_poses(truth.pairs, found, 1, OUTLINE, CAMERA, lambda flange: np.zeros(len(flange), bool))
-    with fails_with("E-PLAN-NO-SIGMA … park-martin"):
-        plan_poses(truth.pairs, handeye(truth.pairs, method="park-martin"))
-    with fails_with("E-PLAN-NO-VIEW"):
-        plan_poses(truth.pairs, found, 1, 1000 * OUTLINE, CAMERA)
+    refuses("E-PLAN-NO-SIGMA … park-martin", plan_poses, truth.pairs, handeye(truth.pairs, method="park-martin"))
+    refuses("E-PLAN-NO-VIEW", plan_poses, truth.pairs, found, 1, 1000 * OUTLINE, CAMERA)
 
 
 @pytest.fixture
@@ -120,19 +118,13 @@ def test_poses_and_joint_values_are_named(command, taken, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(command, taken):
+def test_a_robot_that_does_not_reach_the_poses_taken_is_refused_and_a_limit_that_some_pass_is_noted(command, taken):
     poses, robot_file = taken
     arm = mh80()
     save_robot(robot_file, replace(arm, rows=tuple(replace(row, a=row.a / 9, d=row.d / 9) for row in arm.rows)))
     said = "reaches 0 of the 6 poses taken, first not line 2; give the robot's own file"
     assert_error(command("plan", poses, "--robot", robot_file), INPUT, said)
-
-
-@pytest.mark.slow
-def test_a_limit_that_some_poses_taken_pass_is_noted(command, taken):
-    """The limit is halfway between the second and third value of the first joint."""
-    poses, robot_file = taken
-    arm = mh80()
+    # The limit is halfway between the second and third value of the first joint.
     first = np.sort(inverse(arm, TAKEN.pairs.base_from_flange).q[:, 0])
     assert (np.abs(first) < np.radians(60)).all()  # so that turned round the robot would have to bend over backwards
     limited = Joint("revolute", float(first[1:3].mean()), np.radians(60))

@@ -14,6 +14,7 @@ from stcal.handeye import HandEyePoses
 from stcal.handeye.data.pose_content import PoseSide, Said
 from stcal.handeye.data.pose_files import read_side
 from stcal.io.table import POSE, pose_cells
+from tests.shared import written
 
 
 def read_robot(path: Path, said: Said, quaternions: Order = "wxyz") -> PoseSide:
@@ -35,8 +36,7 @@ def table(path: Path, sides: dict[str, Poses], edit: Callable | None = None, uni
     ]
     if edit:
         edit(rows)
-    path.write_text("\n".join(",".join(line) for line in [[*columns, *heads], *rows]) + "\n")
-    return path
+    return written(path, "\n".join(",".join(line) for line in [[*columns, *heads], *rows]) + "\n")
 
 
 def poses_file(path: Path, truth, edit: Callable | None = None) -> Path:
@@ -90,15 +90,13 @@ def stacks(folder: Path, pairs: HandEyePoses) -> Arguments:
 def objects(folder: Path, pairs: HandEyePoses) -> Arguments:
     sides = {name: poses.matrix().tolist() for name, poses in sides_of(pairs).items()}
     rows = [{"image": f"{i}.png", **{n: side[i] for n, side in sides.items()}} for i in range(len(pairs))]
-    (folder / "pairs.json").write_text(json.dumps(rows))
-    return [str(folder / "pairs.json")]
+    return [str(written(folder / "pairs.json", json.dumps(rows)))]
 
 
 def moveit(folder: Path, pairs: HandEyePoses) -> Arguments:
     both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
     rows = [{"effector_wrt_world": a.ravel().tolist(), "object_wrt_sensor": b.ravel().tolist()} for a, b in both]
-    (folder / "samples.yaml").write_text(yaml.safe_dump(rows))
-    return [str(folder / "samples.yaml")]
+    return [str(written(folder / "samples.yaml", yaml.safe_dump(rows)))]
 
 
 def easy_handeye(folder: Path, pairs: HandEyePoses, kind: str = "eye_in_hand") -> Arguments:
@@ -107,8 +105,7 @@ def easy_handeye(folder: Path, pairs: HandEyePoses, kind: str = "eye_in_hand") -
     both = zip(in_metres(flange), in_metres(pairs.camera_from_board), strict=True)
     samples = [{"robot": message(a), "tracking": message(b)} for a, b in both]
     content = {"parameters": {"name": "", "calibration_type": kind, "move_group": "manipulator"}, "samples": samples}
-    (folder / "demo.samples").write_text(yaml.safe_dump(content, sort_keys=False))
-    return [str(folder / "demo.samples")]
+    return [str(written(folder / "demo.samples", yaml.safe_dump(content, sort_keys=False)))]
 
 
 def easy_handeye_of_ros1(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -116,15 +113,19 @@ def easy_handeye_of_ros1(folder: Path, pairs: HandEyePoses) -> Arguments:
     sides = (("hand_world_samples", pairs.base_from_flange), ("camera_marker_samples", pairs.camera_from_board))
     for name, poses in sides:
         lists[name] = {"header": {"seq": 0}, "transforms": [message(m) for m in in_metres(poses)]}
-    (folder / "samples.yaml").write_text(yaml.safe_dump({"samples": lists}))
-    return [str(folder / "samples.yaml")]
+    return [str(written(folder / "samples.yaml", yaml.safe_dump({"samples": lists})))]
 
 
 def two(folder: Path, a: str | bytes, b: str | bytes, suffix: str = "txt") -> Arguments:
-    paths = [folder / f"{name}.{suffix}" for name in ("robot", "camera")]
-    for path, content in zip(paths, (a, b), strict=True):
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return ["--a", str(paths[0]), "--b", str(paths[1])]
+    files = (written(folder / f"{name}.{suffix}", text) for name, text in (("robot", a), ("camera", b)))
+    return [word for option, path in zip(("--a", "--b"), files, strict=True) for word in (option, str(path))]
+
+
+def columns_in_metres(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """A table with quaternions, of the inverses of both sides."""
+    inverses = pairs.base_from_flange.inverse(), pairs.camera_from_board.inverse()
+    sides = dict(zip(("flange_from_base", "board_from_camera"), inverses, strict=True))
+    return [str(table(folder / "poses.csv", sides, unit="m"))]
 
 
 def npy(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -153,8 +154,7 @@ def euler_columns(folder: Path, pairs: HandEyePoses) -> Arguments:
     head = [f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", *(f"euler_ZYX_{i}_deg" for i in (1, 2, 3)))]
     head += [f"camera_from_board_{c}" for c in ("x_m", "y_m", "z_m", *(f"rotvec_{c}_rad" for c in "xyz"))]
     table = np.hstack([a.translation, angles, b.translation / 1000, vectors])
-    (folder / "euler.csv").write_text("\n".join([",".join(head), *(line(row, ",") for row in table)]) + "\n")
-    return [str(folder / "euler.csv")]
+    return [str(written(folder / "euler.csv", "\n".join([",".join(head), *(line(row, ",") for row in table)]) + "\n"))]
 
 
 def robots(name: str, order: str, columns: tuple[str, str, str], unit: str = "") -> Callable:
@@ -169,9 +169,9 @@ def robots(name: str, order: str, columns: tuple[str, str, str], unit: str = "")
         named[:, by_axis] = values
         table = np.hstack([pairs.base_from_flange.translation, named])
         head = ",".join(["x_mm", "y_mm", "z_mm", *(f"{c}_{unit}" if unit else c for c in columns)])
-        (folder / "robot.csv").write_text("\n".join([head, *(line(row, ",") for row in table)]) + "\n")
-        camera = saved(folder, pairs, metres=False)
-        return ["--a", str(folder / "robot.csv"), "--b", camera, "--rotation", f"robot={name}"]
+        text = "\n".join([head, *(line(row, ",") for row in table)]) + "\n"
+        robot, camera = str(written(folder / "robot.csv", text)), saved(folder, pairs, metres=False)
+        return ["--a", robot, "--b", camera, "--rotation", f"robot={name}"]
 
     return write
 
@@ -196,6 +196,7 @@ def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
 FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "OpenCV's arrays": opencv_arrays,
     "npz": stacks,
+    "columns in metres": columns_in_metres,
     "JSON": objects,
     "MoveIt": moveit,
     "easy_handeye": easy_handeye,

@@ -2,12 +2,27 @@
 
 import cv2
 import numpy as np
+import pycolmap
+
+from stcal.io.cameras.camera_model import CameraModel
+from stcal.io.cameras.foreign_lenses import ForeignLens
 
 RAYS = np.column_stack([np.random.default_rng(4).uniform(-0.6, 0.6, (40, 2)), np.ones(40)])
 D4, D5 = [-0.2, 0.05, 1e-3, -5e-4], [-0.2, 0.05, 1e-3, -5e-4, 0.01]
 K4 = [-0.0152, 0.0132, -0.0248, 0.0178]
 LENS = (911.5, 910.25, 639.0, 359.0)
 SIZE = (1280, 720)
+
+
+def project(lens: CameraModel | ForeignLens, rays=RAYS) -> np.ndarray:
+    """Pixels of rays by a lens that was read; its file may state no size."""
+    return lens.project(rays) if isinstance(lens, ForeignLens) else lens.sized(10_000, 10_000).project(rays)
+
+
+def colmap(model: str, params: list[float], rays=RAYS, size=SIZE) -> np.ndarray:
+    """Pixels of rays by pycolmap, whose pixels begin at their corner."""
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
+    return np.array([camera.img_from_cam(ray) for ray in rays]) - 0.5
 
 
 def matrix(lens=LENS, skew: float = 0.0) -> np.ndarray:

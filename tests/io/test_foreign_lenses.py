@@ -13,7 +13,9 @@ from stcal.io.cameras.camera_model import CameraModel
 from stcal.io.cameras.difference import compare_cameras, fit_lens
 from stcal.io.cameras.foreign_lenses import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.read import read_camera, read_lens
+from tests.io.camera_files import colmap, project
 from tests.outcome import refuses
+from tests.shared import written
 
 WIDTH, HEIGHT = 1280, 961
 COLMAP = {
@@ -44,17 +46,13 @@ def colmap_params(model: str) -> list[float]:
 
 def lens_of(tmp_path, model: str):
     line = " ".join(map(repr, colmap_params(model)))
-    (tmp_path / "cameras.txt").write_text(f"7 {model} {WIDTH} {HEIGHT} {line}\n")
-    return read_lens(tmp_path / "cameras.txt")
+    return read_lens(written(tmp_path / "cameras.txt", f"7 {model} {WIDTH} {HEIGHT} {line}\n"))
 
 
 @pytest.mark.parametrize("model", COLMAP_FOREIGN)
 def test_colmap_projects_the_same(tmp_path, model):
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=colmap_params(model))
-    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
-    lens = lens_of(tmp_path, model)
-    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
-    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    wanted = colmap(model, colmap_params(model), rays())
+    np.testing.assert_allclose(project(lens_of(tmp_path, model), rays()), wanted, atol=1e-10)
     assert int(pycolmap.CameraModelId.__members__[model]) == COLMAP_FOREIGN[model][0]
 
 
@@ -68,14 +66,13 @@ def test_the_camera_of_a_database_is_read(tmp_path, model):
             database.write_camera(camera)
     before = path.read_bytes()
     refuses("E-CAMERA-SEVERAL … 2 cameras, 1 needed … 1, 2 … --name", read_lens, path)
-    lens = read_lens(path, "2")
-    project = lens.project if isinstance(lens, ForeignLens) else lens.sized(0, 0).project
-    wanted = np.array([cameras[1].img_from_cam(ray) for ray in rays()]) - 0.5
-    np.testing.assert_allclose(project(rays()), wanted, atol=1e-10)
+    wanted = colmap(model, params, rays())
+    np.testing.assert_allclose(project(read_lens(path, "2"), rays()), wanted, atol=1e-10)
     assert path.read_bytes() == before
 
 
-def test_a_database_of_something_else_is_refused(tmp_path):
+def test_a_database_of_something_else_is_refused_and_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
+    """A double sphere of 220°: the image reaches beyond what a model here sees."""
     path = tmp_path / "other.db"
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
@@ -86,16 +83,17 @@ def test_a_database_of_something_else_is_refused(tmp_path):
     with sqlite3.connect(path) as database:
         database.execute("DROP TABLE cameras")
     refuses("E-CAMERA-UNREADABLE … no such table: cameras", read_lens, path)
+    text = KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", [])
+    assert fit_lens(read_lens(written(tmp_path / "chain.yaml", text)), WIDTH, HEIGHT).share < 0.5
+    lens_of(tmp_path, "FOV")  # and other commands ask for the conversion
+    refuses("E-CAMERA-MODEL … COLMAP's FOV", read_camera, tmp_path / "cameras.txt")
 
 
 @pytest.mark.parametrize("count", [12, 14])
 def test_opencv_projects_the_same(tmp_path, count):
     matrix = [812.25, 0, 640.125, 0, 809.5, 478.0625, 0, 0, 1]
-    (tmp_path / "c.yaml").write_text(
-        f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {matrix}\n"
-        f"distortion_coefficients: {TILTED[:count]}\n"
-    )
-    lens = read_lens(tmp_path / "c.yaml")
+    text = f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {matrix}\n"
+    lens = read_lens(written(tmp_path / "c.yaml", f"{text}distortion_coefficients: {TILTED[:count]}\n"))
     k = np.reshape(matrix, (3, 3))
     wanted = cv2.projectPoints(rays(), np.zeros(3), np.zeros(3), k, np.array(TILTED[:count]))[0].reshape(-1, 2)
     np.testing.assert_allclose(lens.project(rays()), wanted, atol=1e-10)
@@ -103,8 +101,8 @@ def test_opencv_projects_the_same(tmp_path, count):
 
 
 def kalibr(tmp_path, lens: str, shape: list[float], distortion: str = "none", k: tuple[float, ...] = ()) -> ForeignLens:
-    (tmp_path / "chain.yaml").write_text(KALIBR.format(lens, [*shape, 400.5, 402.0, 640, 478], distortion, list(k)))
-    return read_lens(tmp_path / "chain.yaml")
+    text = KALIBR.format(lens, [*shape, 400.5, 402.0, 640, 478], distortion, list(k))
+    return read_lens(written(tmp_path / "chain.yaml", text))
 
 
 def test_kalibrs_lenses_project_by_their_papers(tmp_path):
@@ -121,8 +119,7 @@ def test_kalibrs_lenses_project_by_their_papers(tmp_path):
     )
     omni, sphere = kalibr(tmp_path, "omni", [0.3]), kalibr(tmp_path, "ds", [0.3, 0.0])
     np.testing.assert_allclose(sphere.project(r), omni.project(r), atol=1e-10)
-    camera = pycolmap.Camera(model="EUCM", width=WIDTH, height=HEIGHT, params=[*focal, *centre + 0.5, 0.6, 1.1])
-    wanted = np.array([camera.img_from_cam(ray) for ray in r]) - 0.5
+    wanted = colmap("EUCM", [*focal, *centre + 0.5, 0.6, 1.1], r)
     np.testing.assert_allclose(kalibr(tmp_path, "eucm", [0.6, 1.1]).project(r), wanted, atol=1e-10)
 
 
@@ -135,8 +132,7 @@ def test_kalibrs_lenses_project_by_their_papers(tmp_path):
     ],
 )
 def test_kalibrs_distortions_are_colmaps(tmp_path, distortion, k, model, params):
-    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=[400.5, 402.0, 640.5, 478.5, *params])
-    wanted = np.array([camera.img_from_cam(ray) for ray in rays()]) - 0.5
+    wanted = colmap(model, [400.5, 402.0, 640.5, 478.5, *params], rays())
     np.testing.assert_allclose(kalibr(tmp_path, "omni", [0.0], distortion, k).project(rays()), wanted, atol=1e-10)
 
 
@@ -154,12 +150,10 @@ def test_mrcals_splines_project_as_mrcal_does(tmp_path, order):
     numbers = [1200, 1205, 999.5, 749.5, *np.round(0.02 * np.sin(np.arange(176)), 6).tolist()]
     name = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order={order}_Nx=11_Ny=8_fov_x_deg=120"
     text = f"{{'lensmodel': '{name}', 'intrinsics': {numbers}, 'imagersize': [2000, 1500]}}"
-    (tmp_path / "c.cameramodel").write_text(text)
-    lens = read_lens(tmp_path / "c.cameramodel")
-    found = lens.project(np.array([[0.1, 0.2, 1], [0.5, -0.4, 1], [-1, 0.6, 1]]))
+    path = written(tmp_path / "c.cameramodel", text)
+    found = read_lens(path).project(np.array([[0.1, 0.2, 1], [0.5, -0.4, 1], [-1, 0.6, 1]]))
     np.testing.assert_allclose(found, MRCAL[order], atol=1e-9)
-    (tmp_path / "c.cameramodel").write_text(text.replace("1205,", ""))
-    refuses("E-CAMERA-COEFFICIENTS … 179 … 11 … 8 … 180", read_lens, tmp_path / "c.cameramodel")
+    refuses("E-CAMERA-COEFFICIENTS … 179 … 11 … 8 … 180", read_lens, written(path, text.replace("1205,", "")))
 
 
 @pytest.mark.slow
@@ -181,18 +175,6 @@ def test_a_fit_is_off_by_no_more_than_it_says(tmp_path, model, most_px):
     assert found.share == 1
 
 
-def test_a_lens_that_none_of_ours_is_like_says_so(tmp_path):
-    """A double sphere of 220°: the image reaches beyond what a model here sees."""
-    (tmp_path / "chain.yaml").write_text(KALIBR.format("ds", [-0.2, 0.6, 200.0, 200.0, 640, 478], "none", []))
-    lens = read_lens(tmp_path / "chain.yaml")
-    assert fit_lens(lens, WIDTH, HEIGHT).share < 0.5
-
-
-def test_other_commands_ask_for_the_conversion(tmp_path):
-    lens_of(tmp_path, "FOV")
-    refuses("E-CAMERA-MODEL … COLMAP's FOV", read_camera, tmp_path / "cameras.txt")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -206,8 +188,7 @@ def test_other_commands_ask_for_the_conversion(tmp_path):
     ],
 )  # fmt: skip
 def test_a_wrong_lens_is_named(tmp_path, text, message):
-    (tmp_path / "camera").write_text(text)
-    refuses(message, read_lens, tmp_path / "camera")
+    refuses(message, read_lens, written(tmp_path / "camera", text))
 
 
 CAHVOR = (4842.918, 4842.771, 1970.528, 1085.302, -0.001, 0.002, -0.637, -0.002, 0.016)
@@ -215,11 +196,10 @@ CAHVOR = (4842.918, 4842.771, 1970.528, 1085.302, -0.001, 0.002, -0.637, -0.002,
 
 def cahvor_file(path, numbers):
     text = f"{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': {list(numbers)}, 'imagersize': [4000, 2200]}}"
-    path.write_text(text)
-    return read_lens(path)
+    return read_lens(written(path, text))
 
 
-def test_cahvor_projects_as_mrcal_does(tmp_path):
+def test_cahvor_projects_as_mrcal_does_and_about_the_axis_of_the_image_as_opencv(tmp_path):
     """Numbers of mrcal's own test of projections, test/test-projections.py, px."""
     lens = cahvor_file(tmp_path / "a.cameramodel", CAHVOR)
     assert isinstance(lens, ForeignLens)
@@ -227,18 +207,15 @@ def test_cahvor_projects_as_mrcal_does(tmp_path):
     told = [[2143.17840406, 1442.93419919], [-92.63813066, 1653.09646897], [-249.83199315, -2606.46477164]]
     assert lens.project(rays) == pytest.approx(np.array(told), abs=1e-6)
     refuses("E-CAMERA-COEFFICIENTS … 8 … LENSMODEL_CAHVOR", cahvor_file, tmp_path / "a.cameramodel", CAHVOR[:8])
-
-
-def test_cahvor_about_the_axis_of_the_image_is_opencvs(tmp_path):
     lens = cahvor_file(tmp_path / "a.cameramodel", (*CAHVOR[:4], 0, 0, 0.01, -0.1, 0.02))
     assert isinstance(lens, CameraModel)
     assert lens.focal == pytest.approx([1.01 * CAHVOR[0], 1.01 * CAHVOR[1]])
     assert lens.distortion[:4] == pytest.approx([-0.1 / 1.01, 0.02 / 1.01, 0, 0])
     # … and as the formula goes on when the axis is turned by hardly anything
     near = cahvor_file(tmp_path / "b.cameramodel", (*CAHVOR[:4], 1e-12, 0, 0.01, -0.1, 0.02))
-    rays = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.0]])
+    turned = np.array([[0.3, -0.2, 1.0], [-0.1, 0.25, 1.0]])
     assert isinstance(near, ForeignLens)
-    assert near.project(rays) == pytest.approx(lens.sized(4000, 2200).project(rays), abs=1e-6)
+    assert near.project(turned) == pytest.approx(lens.sized(4000, 2200).project(turned), abs=1e-6)
 
 
 def turned_lens(angle_deg, region=None) -> tuple[ForeignLens, Camera, Rigid]:
@@ -259,7 +236,8 @@ def inside(polygon: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_fit_turns_the_camera_where_that_helps():
+def test_a_fit_turns_the_camera_where_the_lens_was_determined_which_is_compared_by_its_own_projection():
+    """Not by the model that is fitted to it, which is a pixel off."""
     lens, camera, turn = turned_lens([2.0, -3.0, 1.0])
     found = fit_lens(lens, WIDTH, HEIGHT)
     assert found.rms_px < 1e-3
@@ -267,14 +245,6 @@ def test_a_fit_turns_the_camera_where_that_helps():
     np.testing.assert_allclose(found.camera.centre, camera.centre, atol=0.1)
     straight = fit_lens(ForeignLens("", camera.project, WIDTH, HEIGHT), WIDTH, HEIGHT)
     assert straight.camera_from_lens.angle_rad() == 0
-
-
-REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
-
-
-@pytest.mark.slow
-def test_a_lens_is_fitted_where_it_was_determined_and_compared_by_its_own_projection():
-    """Not by the model that is fitted to it, which is a pixel off."""
     lens, camera, turn = turned_lens([1.0, 2.0, 0.0], REGION)  # beyond the region it is 3000 px off
     pixels = np.random.default_rng(0).uniform([0, 0], [WIDTH, HEIGHT], (500, 2))
     np.testing.assert_array_equal(lens.determined(pixels), inside(REGION, pixels))
@@ -293,18 +263,18 @@ def test_a_lens_is_fitted_where_it_was_determined_and_compared_by_its_own_projec
     assert 0.2 < np.nanmax(compare_cameras(fitted, longer).lengths()) < 0.7
 
 
-def test_mrcals_region_is_read(tmp_path):
+REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
+
+
+def test_mrcals_region_is_read_and_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(tmp_path, recwarn):
     text = (
         "{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
         f"'valid_intrinsics_region': {REGION.tolist()}, 'imagersize': [{WIDTH}, {HEIGHT}]}}"
     )
-    (tmp_path / "c.cameramodel").write_text(text)
-    np.testing.assert_array_equal(read_lens(tmp_path / "c.cameramodel").region, REGION)
-    (tmp_path / "c.cameramodel").write_text(text.replace(str(REGION.tolist()), "[1, 2, 3]"))
-    refuses("E-CAMERA-CONTENT … valid_intrinsics_region", read_lens, tmp_path / "c.cameramodel")
-
-
-def test_a_projection_beyond_all_numbers_is_no_pixel_and_no_warning(recwarn):
+    path = written(tmp_path / "c.cameramodel", text)
+    np.testing.assert_array_equal(read_lens(path).region, REGION)
+    wrong = written(path, text.replace(str(REGION.tolist()), "[1, 2, 3]"))
+    refuses("E-CAMERA-CONTENT … valid_intrinsics_region", read_lens, wrong)
     lens = ForeignLens("too strong", lambda rays: 1e308 * rays[:, :2] * 10, 10, 10)
     assert not np.isfinite(lens.project(np.ones((2, 3)))).any()
     assert not recwarn.list

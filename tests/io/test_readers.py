@@ -1,6 +1,6 @@
 """Readers of files that people or other programs write: another encoding, line end or order of keys changes nothing.
 
-One key more is named. Camera files: ``test_camera_programs.py``.
+One key more is named. Camera files: ``test_camera.py``.
 """
 
 import json
@@ -18,39 +18,21 @@ from stcal.errors import InputNote, StcalError
 from stcal.handeye.data.pose_content import Said
 from stcal.handeye.data.pose_files import read_pairs, read_side
 from stcal.io.files import text_of
-from stcal.io.table import read_table
+from stcal.io.table import POSE, read_table
 from stcal.locate.layout import load_plan
 from stcal.robot.descriptions import load_universal, load_urdf
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
+from stcal.robot.kinematics.robot_model import Robot, mh80
 from stcal.sfm.budget.combine import statement_of
+from tests.boards.test_bundle import BUNDLE
+from tests.boards.test_files import KALIBR, TAG, TARGET
+from tests.io.test_lengths import BOARDS
+from tests.robot.test_descriptions import UR5E, yaml_of
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
-CIRCLES = "\n".join(
-    f'  {{ id = "{i}", x_mm = {x}, y_mm = {y}, radius_mm = 5.0 }},'
-    for i, (x, y) in enumerate([(0, 0), (40, 0), (0, 40), (45, 50), (20, 25)])
-)
-"""Five circles of a face."""
-LAYOUT = (
-    'type = "tags"\norigin = 0\n\n[[tag]]\ndictionary = "tag36h11"\nid = 0\nsize_mm = 60.0\nx_mm = 0.0\ny_mm = 0.0\n'
-)
-ROBOT = 'name = "a"\nconvention = "standard"\n' + "".join(
-    f"\n[[joint]]\na_mm = {a}\nalpha_deg = {alpha}\nd_mm = {d}\ntheta_deg = 0.0\n"
-    for a, alpha, d in ((0, 90, 300), (400, 0, 0), (350, 0, 0), (0, 90, 100), (0, -90, 90), (0, 0, 80))
-)
-LINKS = (
-    ("shoulder", 0, 0, 0.1807, 0),
-    ("upper_arm", 0, 0, 0, 1.570796326794897),
-    ("forearm", -0.6127, 0, 0, 0),
-    ("wrist_1", -0.57155, 0, 0.17415, 0),
-    ("wrist_2", 0, -0.11985, 0, 1.570796326794897),
-    ("wrist_3", 0, 0.11655, 0, -1.570796326794897),
-)
-UR = "kinematics: {hash: calib_1,\n" + ",\n".join(
-    f"  {link}: {{x: {x}, y: {y}, z: {z}, roll: {roll}, pitch: 0, yaw: 0}}" for link, x, y, z, roll in LINKS
-)
-UR += "}\n"
-"""A UR10e's kinematics as ur_calibration writes them, with its nominal numbers."""
 SINES = ((1, 0.0, 1.0), (2, 0.6, 0.8), (3, -0.6, 0.8), (4, 0.8, 0.6))
+ROWS = "".join(f"{10 + i}.5 {0.1 * i:.1f} 0.2 0.3 0.0 0.0 {s} {c}\n" for i, s, c in SINES)
+CELLS = "".join(f"{i}.png,{i}.5,2,{-i},{c},{s},0,0\n" for i, s, c in SINES)
 EASY = "parameters: {eye_on_hand: true}\nsamples:\n" + "".join(
     f"- robot: {{translation: {{x: {x}, y: 0.1, z: 0.5}}, rotation: {{x: {s}, y: 0.0, z: 0.0, w: {c}}}}}\n"
     f"  optical: {{translation: {{x: 0.0, y: {x}, z: 0.7}}, rotation: {{x: 0.0, y: {s}, z: 0.0, w: {c}}}}}\n"
@@ -72,12 +54,8 @@ def of_target(path: Path) -> np.ndarray:
     return np.column_stack([face.xy_mm, face.radius_mm])
 
 
-def of_robot(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_robot(path)).splitlines())
-
-
-def of_universal(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_universal(path).robot).splitlines())
+def rows_of(load: Callable[[Path], Robot]) -> Callable[[Path], np.ndarray]:
+    return lambda path: np.array(robot_toml(load(path)).splitlines())
 
 
 def of_robot_poses(path: Path) -> np.ndarray:
@@ -108,37 +86,16 @@ MATRICES = [
 ]
 
 
-def of_urdf(path: Path) -> np.ndarray:
-    return np.array(robot_toml(load_urdf(path).robot).splitlines())
-
-
 def of_statement(path: Path) -> np.ndarray:
     return np.array([repr(statement_of(StatedSize(), path))])
 
 
 READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
     "table": (TABLE, of_table),
-    "dots": ('rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\nsigma_mm = 0.01\n', of_board),
-    "chessboard": ('type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\n', of_board),
-    "charuco": (
-        'type = "charuco"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\nmarker_mm = 15.0\ndictionary = "4X4_50"\n',
-        of_board,
-    ),
-    "aprilgrid": ('type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\n', of_board),
-    "asymmetric circles": (
-        'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n',
-        of_board,
-    ),
-    "Kalibr, AprilGrid": (
-        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n",
-        of_board,
-    ),
-    "target": (
-        'name = "a"\npolarity = "dark"\n\n[[face]]\nid = "1"\norigin = "0"\nx = "1"\ny = "2"\ncircles = [\n'
-        f"{CIRCLES}\n]\n",
-        of_target,
-    ),
-    "robot": (ROBOT, of_robot),
+    **{name: (text.format(20.0, 6.0), of_board) for name, text in BOARDS.items()},
+    "Kalibr, AprilGrid": (KALIBR["aprilgrid"], of_board),
+    "target": (TARGET, of_target),
+    "robot": (robot_toml(mh80()), rows_of(load_robot)),
     "easy_handeye": (EASY, of_pairs),
     "body": (
         'name = "a"\n\n[[face]]\nid = "1"\n'
@@ -156,31 +113,20 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         "y_mm = 0.0\nz_mm = 0.0\nqw = 0.8\nqx = 0.6\nqy = 0.0\nqz = 0.0\n",
         lambda path: load_boards(path).xyz_mm(),
     ),
-    "tags": (LAYOUT.replace("origin = 0\n", ""), of_board),
-    "apriltag_ros": (
-        "tag_family: tag36h11\ntag_bundles: [{name: a, layout: [{id: 0, size: 0.08, x: 0.1, y: 0, z: 0, qw: 1.0}]}]\n",
-        of_board,
-    ),
-    "Universal Robots": (UR, of_universal),
-    "poses, rows of TUM": (
-        "".join(f"{10 + i}.5 {0.1 * i:.1f} 0.2 0.3 0.0 0.0 {s} {c}\n" for i, s, c in SINES),
-        of_robot_poses,
-    ),
-    "poses, table": (
-        ",".join(["image", *(f"base_from_flange_{c}" for c in ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"])])
-        + "\n"
-        + "".join(f"{i}.png,{i}.5,2,{-i},{c},{s},0,0\n" for i, s, c in SINES),
-        of_robot_poses,
-    ),
-    "URDF": (URDF, of_urdf),
-    "calibration.conf": (CONF, of_universal),
+    "tags": (TAG, of_board),
+    "layout": (f"origin = 1\n{TAG}", lambda path: np.array([repr(load_plan(path))])),
+    "apriltag_ros": (BUNDLE, of_board),
+    "Universal Robots": (yaml_of(UR5E), rows_of(lambda path: load_universal(path).robot)),
+    "poses, rows of TUM": (ROWS, of_robot_poses),
+    "poses, table": (f"image,{','.join(f'base_from_flange_{name}' for name in POSE)}\n{CELLS}", of_robot_poses),
+    "URDF": (URDF, rows_of(lambda path: load_urdf(path).robot)),
+    "calibration.conf": (CONF, rows_of(lambda path: load_universal(path).robot)),
     "statement": ('[fields]\noperator = "A"\n\n[board]\ntemperature_c = 21.5\n', of_statement),
     "poses, JSON": (json.dumps({"base_from_flange": MATRICES, "units": "m"}, indent=1), of_robot_poses),
     "poses, MoveIt": (
         "".join(f"- effector_wrt_world: {each}\n  object_wrt_sensor: {each}\n" for each in MATRICES),
         of_pairs,
     ),
-    "layout": (LAYOUT, lambda path: np.array([repr(load_plan(path))])),
 }
 OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy", "apriltag_ros", "Universal"))]
 OF_ROWS = [name for name in READERS if "table" in name or "rows" in name]
@@ -222,9 +168,8 @@ def test_every_reader_decodes_its_text(tmp_path, name):
     text, read = READERS[name]
     wanted, said = outcome(read, tmp_path / "file", text.encode())
     assert wanted is not None, said
-    found, said = outcome(
-        read, tmp_path / "file", "\n{}\n".format(text.rstrip("\n")).replace("\n", "\r\n").encode("utf-16")
-    )
+    other = "\n{}\n".format(text.rstrip("\n")).replace("\n", "\r\n")
+    found, said = outcome(read, tmp_path / "file", other.encode("utf-16"))
     assert found is not None, said
     np.testing.assert_array_equal(found, wanted)
 
@@ -264,7 +209,7 @@ def test_columns_of_a_table_may_stand_in_any_order(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "between", "end"), [("URDF", "  <joint", "</robot>\n"), ("Universal Robots", ",\n", "}\n")]
+    ("name", "between", "end"), [("URDF", "  <joint", "</robot>\n"), ("Universal Robots", "\n  ", "\n")]
 )
 def test_parts_of_a_robot_may_stand_in_any_order(tmp_path, name, between, end):
     text, read = READERS[name]

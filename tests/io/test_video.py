@@ -46,38 +46,28 @@ def clip_of(frames: list[np.ndarray], path: Path) -> Path:
     return path
 
 
-def test_a_smear_in_any_direction_is_less_sharp():
+def test_a_smear_in_any_direction_is_less_sharp_and_a_picture_at_rest_is_one_view():
     sharp = moving(1)[0]
     for size in ((7, 1), (1, 7), (3, 3)):
         assert sharpness(cv2.blur(sharp, size)) < 0.7 * sharpness(sharp)
     assert sharpness(sharp // 2) == pytest.approx(sharpness(sharp), rel=0.05)  # brightness does not count
     assert sharpness(np.zeros((40, 40), np.uint8)) == 0
-
-
-@pytest.mark.slow
-def test_frames_are_sharp_and_apart():
-    count, blurred = 40, set(range(0, 40, 3))
-    numbers = [frame.number for frame in chosen_frames(iter(moving(count, blurred)), AUTO)]
-    assert not blurred & set(numbers)
-    assert (np.diff(numbers) >= PER_VIEW / 2).all()
-    assert 0.5 * count / PER_VIEW < len(numbers) <= np.ceil(count / PER_VIEW) + 1
-
-
-def test_a_picture_at_rest_is_one_view():
     still = moving(1)[0]
     rng = np.random.default_rng(1)
     noisy = [np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(20)]
     assert len(list(chosen_frames(iter(noisy), AUTO))) == 1
-
-
-def test_of_every_so_many_frames_the_sharpest_is_taken():
     numbers = [frame.number for frame in chosen_frames(iter(moving(20, {0, 2, 3, 4, 7})), 5)]
     assert numbers[0] == 1
     assert [number // 5 for number in numbers] == [0, 1, 2, 3]
 
 
 @pytest.mark.slow
-def test_chosen_frames_are_written_and_listed_and_replace_earlier_ones(tmp_path):
+def test_frames_are_sharp_and_apart_and_replace_earlier_ones(tmp_path):
+    count, blurred = 40, set(range(0, 40, 3))
+    numbers = [frame.number for frame in chosen_frames(iter(moving(count, blurred)), AUTO)]
+    assert not blurred & set(numbers)
+    assert (np.diff(numbers) >= PER_VIEW / 2).all()
+    assert 0.5 * count / PER_VIEW < len(numbers) <= np.ceil(count / PER_VIEW) + 1
     video = clip_of(moving(40), tmp_path / "clip.mp4")
     with pytest.warns(InputNote, match=r"clip.mp4: \d+ frames chosen.*rolling shutter"):
         first = write_frames(video, tmp_path / "frames", 4)

@@ -37,7 +37,7 @@ def files(tmp_path):
     return hand_eye, poses, offset
 
 
-def test_the_chain_is_the_product(files):
+def test_the_chain_is_the_product_and_covariances_of_the_robot_add_up(files):
     chain = read_chain(*files)
     goal = chain.base_from_goal("a", SEEN)
     assert np.allclose(goal.rigid.matrix(), (FLANGE @ MOUNT @ SEEN.rigid @ OFFSET).matrix(), atol=1e-9)
@@ -45,25 +45,27 @@ def test_the_chain_is_the_product(files):
     # A turn of the camera's pose by σ = 1e-3 rad is an arc at the goal, 100 mm off: more than its own 0.1 mm.
     exact = UncertainRigid(SEEN.rigid, np.diag([0.0] * 3 + [0.01] * 3))
     assert np.trace(goal.covariance[3:, 3:]) > np.trace(chain.base_from_goal("a", exact).covariance[3:, 3:]) + 0.015
-
-
-def test_covariances_of_the_robot_add_up(files):
-    hand_eye, poses, _ = files
-    plain = read_chain(hand_eye, poses).base_from_goal("a", SEEN).covariance
+    plain = read_chain(*files[:2]).base_from_goal("a", SEEN).covariance
     own = np.diag([1e-7] * 3 + [0.04] * 3)
     text = ",".join(["scene", *POSE, *COVARIANCE]) + "\n" + ",".join(["a", *pose_cells(FLANGE, own)]) + "\n"
-    poses.write_text(text)
-    more = read_chain(hand_eye, poses).base_from_goal("a", SEEN).covariance
+    files[1].write_text(text)
+    more = read_chain(*files[:2]).base_from_goal("a", SEEN).covariance
     assert np.allclose(np.diag(more - plain)[:3], 1e-7)
     assert (np.diag(more - plain)[3:] > 0.04).all()
 
 
-def test_a_fixed_camera_needs_no_robot_poses(files, tmp_path):
+def test_a_fixed_camera_needs_no_robot_poses_and_a_registration_leads_to_the_base_too(files, tmp_path):
     fixed = tmp_path / "fixed.json"
     fixed.write_text(json.dumps({"base_from_camera": MOUNT.matrix().tolist(), "covariance": None}))
     goal = read_chain(fixed, None).base_from_goal("any", SEEN)
     assert np.allclose(goal.rigid.matrix(), (MOUNT @ SEEN.rigid).matrix())
     refuses("E-OPTION-NEEDS … fixed.json … the camera is fixed", read_chain, fixed, files[1])
+    file = registered(tmp_path / "register.json", MOUNT.matrix())
+    goal = goal_chain(registration=file, offset=files[2]).base_from_goal("any", SEEN)
+    mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
+    wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
+    assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
+    assert np.allclose(goal.covariance, wanted.covariance)
 
 
 def registered(path, b_from_a, model="rigid", covariance=None):
@@ -71,15 +73,6 @@ def registered(path, b_from_a, model="rigid", covariance=None):
     content["covariance"] = (np.eye(6) * 1e-6 if covariance is None else covariance).tolist()
     path.write_text(json.dumps(content))
     return path
-
-
-def test_a_registration_leads_to_the_base_too(files, tmp_path):
-    file = registered(tmp_path / "register.json", MOUNT.matrix())
-    goal = goal_chain(registration=file, offset=files[2]).base_from_goal("any", SEEN)
-    mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
-    wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
-    assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
-    assert np.allclose(goal.covariance, wanted.covariance)
 
 
 @pytest.mark.parametrize(
@@ -95,11 +88,15 @@ def test_a_registration_that_is_no_rigid_motion_is_refused(tmp_path, matrix, mod
     refuses(f"E-REGISTER-FILE … {model} … --model rigid", goal_chain, registration=file)
 
 
-def test_scenes_are_found_by_another_column(files):
+def test_scenes_are_found_by_another_column_and_the_order_of_quaternions_is_an_option(files):
     hand_eye, poses, _ = files
     poses.write_text(poses.read_text().replace("scene", "image"))
     assert list(read_chain(hand_eye, poses, key="image").flange) == ["a"]
     refuses("E-TABLE-COLUMN-MISSING … scene", read_chain, hand_eye, poses)
+    x, y, z, qw, qx, qy, qz = pose_cells(FLANGE)
+    poses.write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["a", x, y, z, qx, qy, qz, qw]) + "\n")
+    found = read_chain(hand_eye, poses, quaternions="xyzw").flange["a"].rigid
+    assert np.allclose(found.matrix(), FLANGE.matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -130,14 +127,6 @@ def test_what_does_not_lead_to_the_base_is_named(files):
     hand_eye.write_text(json.dumps({"base_from_camera": np.eye(4).tolist()}))
     with pytest.raises(InputError, match="no 'obj_from_goal'"):
         read_chain(hand_eye, None, offset)
-
-
-def test_the_order_of_the_robots_quaternions_is_an_option(files):
-    hand_eye, poses, _ = files
-    x, y, z, qw, qx, qy, qz = pose_cells(FLANGE)
-    poses.write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["a", x, y, z, qx, qy, qz, qw]) + "\n")
-    found = read_chain(hand_eye, poses, quaternions="xyzw").flange["a"].rigid
-    assert np.allclose(found.matrix(), FLANGE.matrix(), atol=1e-12)
 
 
 CAMERA_ON_FLANGE = Rigid.exp([0.1, -0.2, 1.5, 60, -30, 110])

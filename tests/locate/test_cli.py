@@ -6,38 +6,26 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
-from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.read import save_camera
 from stcal.io.table import POSE, pose_cells, read_table
-from stcal.locate.layout import layout_toml, load_layout
-from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
-from tests.outcome import ended
-from tests.support.tags import random_pose
+from stcal.locate.layout import load_layout
+from tests.fuzzing.stock import write_tags
+from tests.locate.drawn_target import LAYOUT, PER_MM, SHEET_MM, sheet, tilted
+from tests.outcome import program
+from tests.shared import write_rows, written
 
-
-@pytest.fixture
-def locate(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["stcal", "locate", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
+locate = program("stcal", "locate")
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Two scenes, one without tags; layout, camera, hand-eye and robot poses."""
-    root = tmp_path_factory.mktemp("locate")
-    for name, image in (("good", photo(tilted(30))), ("empty", np.full((900, 1200), 99, np.uint8))):
-        (root / "scenes" / name).mkdir(parents=True)
-        cv2.imwrite(str(root / "scenes" / name / "1.png"), image)
-    (root / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
-    save_camera(root / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
-    (root / "he.json").write_text(json.dumps({"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}))
-    rows = [",".join([name, *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]) for name in ("good", "empty")]
-    (root / "robot.csv").write_text("\n".join([",".join(["scene", *POSE]), *rows]) + "\n")
+    """The stock's scene ``a``, another one without tags, and five photographs of the target above a board of dots."""
+    root = tmp_path_factory.mktemp("locate") / "tags"
+    write_tags(root, np.random.default_rng(1), with_dots(), 5)
+    (root / "scenes/empty").mkdir()
+    cv2.imwrite(str(root / "scenes/empty/1.png"), np.full((900, 1200), 99, np.uint8))
+    flange = pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))
+    write_rows(root / "robot.csv", ["scene", *POSE], [[name, *flange] for name in ("a", "empty")])
     return root
 
 
@@ -49,14 +37,14 @@ def run(locate, files):
 
 def test_run_writes_accepted_poses(run, files, tmp_path):
     out, record, report = tmp_path / "poses.csv", tmp_path / "all.json", tmp_path / "page.html"
-    robot = ["--hand-eye", files / "he.json", "--robot-poses", files / "robot.csv"]
+    robot = ["--hand-eye", files / "handeye.json", "--robot-poses", files / "robot.csv"]
     code, shown, _ = run("", *robot, "--out", out, "--json", record, "--report", report)
     assert code == 0
-    (row,) = (line.split() for line in shown.splitlines() if line.startswith("good") and "accept" in line)
-    assert row[:4] == ["good", "accept", "6", "1"]
+    (row,) = (line.split() for line in shown.splitlines() if line.startswith("a ") and "accept" in line)
+    assert row[:4] == ["a", "accept", "6", "2"]
     assert "no tag of" in shown
     table = read_table(out, "poses")
-    assert table.text("scene") == ["good"]
+    assert table.text("scene") == ["a"]
     seen, goal = table.poses()[0], table.poses("base_from_goal_")[0]
     assert np.linalg.norm((seen @ tilted(30).inverse()).log()[:3]) < np.radians(0.2)
     chain = Rigid.exp([1, 0, 0, 400, 0, 300]) @ Rigid.exp([0, 0, 1, 0, 0, 50]) @ seen
@@ -66,16 +54,16 @@ def test_run_writes_accepted_poses(run, files, tmp_path):
     scenes = {scene["name"]: scene for scene in json.loads(record.read_text())["scenes"]}
     assert scenes["empty"]["verdict"]["decision"] == "reject"
     assert scenes["empty"]["camera_from_obj"] is None
-    assert all(check["passed"] for check in scenes["good"]["verdict"]["checks"])
-    assert len(scenes["good"]["pose"]["residuals_px"]) == 24
+    assert all(check["passed"] for check in scenes["a"]["verdict"]["checks"])
+    assert len(scenes["a"]["pose"]["residuals_px"]) == 24
     page = report.read_text()
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 3  # of each image
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
 @pytest.mark.slow
 def test_limits_are_options(run):
-    image = "good/1.png"
+    image = "a/1.png"
     assert run(image)[0] == 0
     patent = ("error 0.", "area px²", "det J 1/mm²", "kept", "patent: assumed where the text has no formula")
     for options, parts in [
@@ -109,7 +97,7 @@ def test_options_that_make_no_sense(run, arguments, reason):
 BOARD = 'rows = 4\ncolumns = 9\npitch_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
 
 
-def with_board() -> np.ndarray:
+def with_dots() -> np.ndarray:
     """The target above a board of dots, on one sheet 220 × 320 mm; the board's origin at (30, 230) mm."""
     printed = np.full((320 * PER_MM, int(SHEET_MM[0]) * PER_MM), 255, np.uint8)
     printed[: sheet().shape[0]] = sheet()
@@ -122,25 +110,11 @@ def with_board() -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_calibrate_with_a_board_of_dots(locate, tmp_path):
-    printed, rng = with_board(), np.random.default_rng(1)
-    (tmp_path / "images").mkdir()
-    for k in range(5):
-        turn = random_pose(rng, tilt_deg=(15, 40)).rotation
-        # Looked at in its middle, upright enough for the image's shape.
-        spin = np.arctan2(turn[1, 0], turn[0, 0]) - np.pi / 2
-        c, s = np.cos(-spin), np.sin(-spin)
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
-        place = Rigid(turn, np.array([0, 0, 620.0]) - turn @ [0, 160 - SHEET_MM[1] / 2, 0])
-        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), photo(place, printed))
-    (tmp_path / "board.toml").write_text(BOARD)
-    entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
-    (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
-    save_camera(tmp_path / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
-    out, record = tmp_path / "calibrated.toml", tmp_path / "calibrated.json"
+def test_calibrate_with_a_board_of_dots(locate, files, tmp_path):
+    out, record, board = (tmp_path / name for name in ("calibrated.toml", "calibrated.json", "board.toml"))
     code, shown, _ = locate(
-        *("calibrate", tmp_path / "images", "--camera", tmp_path / "cameras.txt", "--board", tmp_path / "board.toml"),
-        *("--layout", tmp_path / "plan.toml", "--out", out, "--json", record, "--workers", 1),
+        *("calibrate", files / "images", "--camera", files / "cameras.txt", "--board", written(board, BOARD)),
+        *("--layout", files / "plan.toml", "--out", out, "--json", record, "--workers", 1),
     )
     assert code == 0
     assert "5 images, 6 tags" in shown

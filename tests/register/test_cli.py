@@ -6,19 +6,23 @@ import numpy as np
 import pytest
 
 from stcal import register, workflows
-from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
+from stcal.register import Pairs
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, placed
-from tests.outcome import ended, fails_with, lines_of, refuses
+from tests.outcome import lines_of, program, refuses
+from tests.shared import written
 from tests.support.arms import elastic
 from tests.support.point_pairs import B_FROM_A
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 WITH_JOINTS = HEAD + "".join(f",q{i}_deg" for i in range(1, 7))
+
+
+run = program("stcal", "register")
 
 
 def points(n: int = 30, seed: int = 0):
@@ -31,26 +35,15 @@ def rows_of(*columns) -> list[str]:
     return [",".join(f"{v:.6f}" for v in row) for row in np.hstack(columns)]
 
 
-def written(folder, rows: list[str], head: str = HEAD):
-    path = folder / "pairs.csv"
-    path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
-    return path
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["stcal", "register", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
+def pairs_file(folder, rows: list[str], head: str = HEAD):
+    return written(folder / "pairs.csv", "\n".join([head, *rows]) + "\n")
 
 
 def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     """A third of the points moved together by 9 mm, as when an instrument is knocked."""
     a, b = points()
     b[::3] += [0, 9, 0]
-    pairs, out = written(tmp_path, rows_of(a, b)), tmp_path / "o.json"
+    pairs, out = pairs_file(tmp_path, rows_of(a, b)), tmp_path / "o.json"
     code, _, err = run(pairs, "--out", out)
     assert code == 3
     assert "20 point pairs agree on one transform and 10 others on another" in err
@@ -73,7 +66,7 @@ def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     ],
 )
 def test_bad_options(run, tmp_path, arguments, says):
-    code, _, err = run(written(tmp_path, rows_of(*points())), *arguments)
+    code, _, err = run(pairs_file(tmp_path, rows_of(*points())), *arguments)
     assert code == 2
     assert says in err
     assert len(lines_of(err)) == 1
@@ -89,7 +82,7 @@ def robot_pairs(tmp_path_factory):
     q = joint_vectors(drawn, 45, rng)
     b = B_FROM_A @ forward(real, q).translation + rng.normal(0, 0.03, (45, 3))
     b[[4, 20, 33]] += [[3.0, 0, 0], [0, -20, 0], [8, 8, 8]]
-    pairs = written(folder, rows_of(forward(drawn, q).translation, b, np.degrees(q)), WITH_JOINTS)
+    pairs = pairs_file(folder, rows_of(forward(drawn, q).translation, b, np.degrees(q)), WITH_JOINTS)
     (folder / "robot.toml").write_text(robot_toml(drawn))
     return folder, pairs, real
 
@@ -131,7 +124,7 @@ def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
     assert np.abs(a - forward(drawn, q).translation).max() > 0.3
     b = B_FROM_A @ a + rng.normal(0, 0.03, (45, 3))
     out = tmp_path / "o.json"
-    pairs = written(tmp_path, rows_of(a, b, np.degrees(q), mass[:, None]), WITH_JOINTS + ",payload_kg")
+    pairs = pairs_file(tmp_path, rows_of(a, b, np.degrees(q), mass[:, None]), WITH_JOINTS + ",payload_kg")
     (tmp_path / "robot.toml").write_text(robot_toml(drawn))
     code, _, err = run(pairs, "--robot", tmp_path / "robot.toml", "--folds", 0, "--out", out)
     assert (code, lines_of(err)) == (0, [])
@@ -140,38 +133,33 @@ def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
     assert content["identified"]["weighting"]["sigma_mm"] == pytest.approx(0.03, rel=0.3)
 
 
-def test_joint_values_are_needed_for_a_robot(run, tmp_path, robot_pairs):
+def test_joint_values_are_needed_and_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):
+    """Eight points for 27 parameters: the transform is written, and the command says that the rest failed."""
     folder, pairs, _ = robot_pairs
     out = tmp_path / "o.json"
-    code, _, err = run(written(tmp_path, rows_of(*points())), "--robot", folder / "robot.toml", "--out", out)
+    code, _, err = run(pairs_file(tmp_path, rows_of(*points())), "--robot", folder / "robot.toml", "--out", out)
     assert code == 2
     assert "q1_deg" in err
     assert "--robot" in err
     head, *rows = pairs.read_text().splitlines()
     rows[5] = rows[5][rows[5].index(",") :]
-    code, _, err = run(written(tmp_path, rows, head), "--robot", folder / "robot.toml")
+    code, _, err = run(pairs_file(tmp_path, rows, head), "--robot", folder / "robot.toml")
     assert code == 2
     assert "line 7" in err
-
-
-def test_joint_vectors_of_fewer_pairs_are_refused(robot_pairs):
-    folder, pairs, _ = robot_pairs
-    read, robot = register.read_pairs(pairs), load_robot(folder / "robot.toml")
-    transform = register.register(read.xyz_a, read.xyz_b, folds=0, allow_ambiguous=True)
-    fewer = Measurements.from_arrays(np.zeros((44, 6)), read.xyz_b[1:])
-    with fails_with("E-ARRAY-SHAPE … 45 point pairs … 44 joint vectors"):
-        workflows.register_with_robot(read, transform, robot, fewer)
-
-
-def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):
-    """Eight points for 27 parameters: the transform is written, and the command says that the rest failed."""
-    folder, pairs, _ = robot_pairs
+    given, robot = register.read_pairs(pairs), load_robot(folder / "robot.toml")
+    transform = register.register(given.xyz_a, given.xyz_b, folds=0, allow_ambiguous=True)
+    fewer = Measurements.from_arrays(np.zeros((44, 6)), given.xyz_b[1:])
+    said = "E-ARRAY-SHAPE … 45 point pairs … 44 joint vectors"
+    refuses(said, workflows.register_with_robot, given, transform, robot, fewer)
     head, *rows = pairs.read_text().splitlines()
-    out = tmp_path / "o.json"
-    code, _, err = run(written(tmp_path, rows[:8], head), "--robot", folder / "robot.toml", "--out", out)
+    code, _, err = run(pairs_file(tmp_path, rows[:8], head), "--robot", folder / "robot.toml", "--out", out)
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
+
+
+def read(*given) -> Pairs:
+    return register.read_pairs(pairs_file(*given))
 
 
 ROWS = ["0,0,0,10,20,30", "1,0,0,11,20,30", "0,2,0,10,22,30", "0,0,3.5,10,20,33.5"]
@@ -182,24 +170,21 @@ def with_cells(cells):
     return [f"{row},{cell}" for row, cell in zip(ROWS, cells, strict=True)]
 
 
-def test_points_lines_and_units(tmp_path):
-    pairs = register.read_pairs(written(tmp_path, [ROWS[0], "# a remark", *ROWS[1:]]))
+def test_points_lines_units_and_noise_of_three_kinds(tmp_path):
+    pairs = read(tmp_path, [ROWS[0], "# a remark", *ROWS[1:]])
     assert list(pairs.lines) == [2, 4, 5, 6]
     np.testing.assert_array_equal(pairs.xyz_a[3], [0, 0, 3.5])
     np.testing.assert_array_equal(pairs.xyz_b[2], [10, 22, 30])
     assert pairs.weights is None
     assert pairs.covariances is None
-    pairs = register.read_pairs(written(tmp_path, ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in"))
+    pairs = read(tmp_path, ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in")
     np.testing.assert_allclose(pairs.xyz_a[1], [1000, 0, 0])
     np.testing.assert_allclose(pairs.xyz_b[0], np.array([10, 20, 30]) * 25.4)
-
-
-def test_noise_of_three_kinds(tmp_path):
     numbered = with_cells([1, 2, 3, 4])
-    assert register.read_pairs(written(tmp_path, numbered, HEAD + ",weight")).weights.tolist() == [1, 2, 3, 4]
-    variances = register.read_pairs(written(tmp_path, numbered, HEAD + ",sigma_um")).covariances
+    assert read(tmp_path, numbered, HEAD + ",weight").weights.tolist() == [1, 2, 3, 4]
+    variances = read(tmp_path, numbered, HEAD + ",sigma_um").covariances
     np.testing.assert_allclose(variances, np.array([1, 4, 9, 16]) * 1e-6)
-    full = register.read_pairs(written(tmp_path, with_cells(["4,1,0,5,2,6"] * 4), f"{HEAD},{COV}")).covariances
+    full = read(tmp_path, with_cells(["4,1,0,5,2,6"] * 4), f"{HEAD},{COV}").covariances
     np.testing.assert_array_equal(full[2], [[4, 1, 0], [1, 5, 2], [0, 2, 6]])
 
 
@@ -221,4 +206,4 @@ def test_noise_of_three_kinds(tmp_path):
     ],
 )
 def test_bad_files(tmp_path, rows, head, message):
-    refuses(message, register.read_pairs, written(tmp_path, rows, head))
+    refuses(message, read, tmp_path, rows, head)

@@ -33,7 +33,7 @@ def test_a_line_is_refused(method):
     refuses("E-POINTS-COLLINEAR", register, a * [1, 0, 0], seen_of(a * [1, 0, 0]), method=method)
 
 
-def test_a_plane_is_solved_rigidly_and_refused_affinely():
+def test_a_plane_is_refused_affinely_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
     a = np.random.default_rng(1).uniform(-100, 100, (25, 3)) * [1, 1, 0]
     found = register(a, seen_of(a), folds=0)
     assert found.inliers.all()
@@ -45,10 +45,7 @@ def test_a_plane_is_solved_rigidly_and_refused_affinely():
     raised = np.vstack([a[:12], [[0, 0, 90]]])
     found = register(raised, seen_of(raised), model="affine", method="least-squares", folds=0)
     assert any("only row 13 keeps the points off a plane" in note for note in found.notes)
-
-
-def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
-    """Any one wrong point off the line fits exactly, and would set the turn about it."""
+    # Any one wrong point off the line fits exactly, and would set the turn about it.
     a = np.vstack([along_a_line(12, 0.0), [[0, 80, 0]]])
     found = register(a, seen_of(a), folds=0, lines=range(2, 15))
     assert any("only line 14 keeps the points off a line" in note for note in found.notes)
@@ -113,13 +110,13 @@ def test_an_axis_that_is_scaled_is_told_from_a_scale_and_a_bend_is_said_beside_i
 )
 def test_another_unit_is_named(factor, unit, method):
     s = scene(0, 40, 0.3)
-    with pytest.raises(InputError, match=rf"distances in b are [\d.]+ times those in a .*is a in {unit} "):
-        register(s.xyz_a / factor, s.xyz_b, method=method)
-    with pytest.raises(InputError, match=rf"distances in a are [\d.]+ times those in b .*is b in {unit} "):
-        register(s.xyz_a, s.xyz_b / factor, method=method)
+    for one, other, a, b in (("b", "a", s.xyz_a / factor, s.xyz_b), ("a", "b", s.xyz_a, s.xyz_b / factor)):
+        said = rf"distances in {one} are [\d.]+ times those in {other} .*is {other} in {unit} "
+        with pytest.raises(InputError, match=said):
+            register(a, b, method=method)
 
 
-def test_points_in_metres_are_doubted_and_a_similarity_tells_units():
+def test_points_in_metres_are_doubted_a_similarity_tells_units():
     s = scene(1, 20)
     found = register(s.xyz_a / 25.4, s.xyz_b, model="similarity", folds=0)
     assert any("the scale is 25.4" in note and "is a in inches" in note for note in found.notes)
@@ -142,16 +139,13 @@ def test_a_mirrored_frame_is_refused(mirror, share, method):
     refuses("E-REGISTER-MIRRORED … 60", register, s.xyz_a @ mirror.T, s.xyz_b, method=method)
 
 
-def test_planes_and_few_points_are_not_called_mirrored():
+def test_planes_few_points_and_a_thin_bent_sheet_are_not_called_mirrored():
+    """What is mirrored fits to noise; of the sheet one sign leaves half of the residuals of the other."""
     for seed in range(12):
         s = scene([seed, 5], 5)
         register(s.xyz_a, s.xyz_b, folds=0)
         flat = s.xyz_a * [1, 1, 0]
         register(flat, s.b_from_a @ flat + (s.xyz_b - s.b_from_a @ s.xyz_a), folds=0)
-
-
-def test_a_thin_bent_sheet_is_not_called_mirrored():
-    """What is mirrored fits to noise; here one sign leaves half of the residuals of the other."""
     rng = np.random.default_rng(5)
     a = np.column_stack([rng.uniform(-100, 100, (200, 2)), rng.normal(0, 0.5, 200)])
     b = a * [1, 1, -0.3] + rng.normal(0, 0.1, a.shape)
@@ -159,13 +153,10 @@ def test_a_thin_bent_sheet_is_not_called_mirrored():
     register(a, b, folds=0)
 
 
-def test_an_affine_fit_tells_that_it_mirrors():
+def test_an_affine_fit_tells_that_it_mirrors_and_least_squares_that_rows_are_far_off():
     s = scene(6, 30)
     found = register(s.xyz_a * [1, 1, -1], s.xyz_b, model="affine", folds=0)
     assert any("is a reflection" in note for note in found.notes)
-
-
-def test_least_squares_tells_that_rows_are_far_off():
     s = scene(10, 40, 0.05)
     found = register(s.xyz_a, s.xyz_b, method="least-squares", folds=0)
     worst = int(np.linalg.norm(found.residuals, axis=1).argmax()) + 1
@@ -215,14 +206,11 @@ def test_a_move_is_located_with_its_size(model, method):
     assert size == pytest.approx(1.0, rel=0.15)
 
 
-def test_a_large_move_is_located_too_and_two_transforms_refused_with_the_row_between_them():
+def test_a_large_move_and_a_drift_are_located_too_and_two_transforms_refused_with_the_row_between():
     a, b = points(2)
     refuses("E-REGISTER-TWO-TRANSFORMS … from row 26 on … separately", register, a, moved_from(25, b, MOVE), folds=0)
     found = register(a, moved_from(26, b, Rigid.exp([0, 0, 0.01, 10, 0, 0])), folds=0, allow_ambiguous=True)
     assert any(note.startswith("from row 27 on") for note in found.notes)
-
-
-def test_a_drift_is_told_from_a_jump():
     a, b = points(3)
     found = register(a, b + np.linspace(0, 1, len(b))[:, None] * [0.6, 0, -0.8], method="least-squares", folds=0)
     [note] = [note for note in found.notes if "drifts against the other along the rows, by " in note]

@@ -42,7 +42,7 @@ def fitted(a, b):
     return found, residual_field(found, inputs(found, a, b))
 
 
-def test_noise_is_not_taken_for_a_field():
+def test_noise_is_not_taken_for_a_field_which_predicts_new_places_and_knows_how_well():
     """One case in a hundred may be: more than one of 8 has a chance of 0.3 %."""
     seen = 0
     for seed in range(8):
@@ -50,9 +50,6 @@ def test_noise_is_not_taken_for_a_field():
         a = rng.uniform(-100, 100, (30, 3))
         seen += fitted(a, B_FROM_A @ a + rng.normal(0, SIGMA, a.shape))[1].seen
     assert seen <= 1
-
-
-def test_field_predicts_new_places_and_knows_how_well():
     squares, plain, corrected = [], [], []
     for seed in range(4):
         a, b = bent(seed, 80)
@@ -73,7 +70,7 @@ def test_field_predicts_new_places_and_knows_how_well():
     assert 0.7 < np.mean(squares) < 1.4
 
 
-def test_errors_of_points_left_out_are_those_of_refits():
+def test_errors_of_points_left_out_are_those_of_refits_and_few_points_have_no_field():
     a, b = bent(3, 25)
     _, field = fitted(a, b)
     for i in range(0, 25, 6):
@@ -82,6 +79,8 @@ def test_errors_of_points_left_out_are_those_of_refits():
         # the field takes small motions to be linear: good to their square, 1e-6
         assert field.plain_mm[i] == pytest.approx(np.linalg.norm(b[i] - refit @ a[i]), rel=1e-3)
     assert field.corrected_mm.mean() < field.plain_mm.mean()
+    assert fitted(*bent(0, 5))[1] is None
+    assert len(fitted(*bent(0, 3 * MOST_POINTS))[1].rows) == MOST_POINTS
 
 
 def test_bent_points_are_taken_back_and_wild_ones_are_not():
@@ -115,7 +114,7 @@ def test_points_of_different_sigma():
     assert errors["told"] < 0.7 * errors["untold"]
 
 
-def test_cubes_by_hand():
+def test_cubes_by_hand_and_without_points_or_width():
     """A grid, undisturbed within 100 mm of its middle, the rest shifted by 5 mm."""
     steps = np.linspace(-200, 200, 9)
     a = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3) + np.array([800, 200, 700])
@@ -134,11 +133,14 @@ def test_cubes_by_hand():
     outer = result.errors[3]
     assert outer[0].mean_mm == pytest.approx(5 * 604 / 729, rel=0.02)
     assert outer[3].mean_mm == pytest.approx(5 * 125 / 729, rel=0.05)
-
-
-def test_few_points_have_no_field_and_many_are_not_all_used():
-    assert fitted(*bent(0, 5))[1] is None
-    assert len(fitted(*bent(0, 3 * MOST_POINTS))[1].rows) == MOST_POINTS
+    a, b = bent(0, 8)
+    found = register(a, b, folds=0)
+    assert cubes(found, inputs(found, a, b)) is None
+    rng = np.random.default_rng(0)
+    flat = np.vstack([rng.uniform(-50, 50, (20, 3)) * [1, 1, 0], rng.uniform(-200, 200, (60, 3))])
+    found = register(flat, B_FROM_A @ flat, model="affine", method="least-squares", folds=0)
+    result = cubes(found, inputs(found, flat, B_FROM_A @ flat))
+    assert result.sides_mm[0] > 100  # the plane in the middle determines no affine transform: left out
 
 
 def test_points_in_the_cube_are_held_out():
@@ -155,17 +157,6 @@ def test_points_in_the_cube_are_held_out():
     assert np.sqrt(3) < np.nanmean(inside) < np.sqrt(3 * 1.25)
 
 
-def test_cubes_without_points_or_width():
-    a, b = bent(0, 8)
-    found = register(a, b, folds=0)
-    assert cubes(found, inputs(found, a, b)) is None
-    rng = np.random.default_rng(0)
-    flat = np.vstack([rng.uniform(-50, 50, (20, 3)) * [1, 1, 0], rng.uniform(-200, 200, (60, 3))])
-    found = register(flat, B_FROM_A @ flat, model="affine", method="least-squares", folds=0)
-    result = cubes(found, inputs(found, flat, B_FROM_A @ flat))
-    assert result.sides_mm[0] > 100  # the plane in the middle determines no affine transform: left out
-
-
 WILD = (3, 17)
 
 
@@ -180,7 +171,8 @@ def found_of(n=40, model="rigid", wild=WILD, where="pairs <a&b>.csv", bend=0.0, 
     return findings(Pairs(where, range(2, n + 2), a, b), result)
 
 
-def test_text_tells_transform_outliers_and_reach():
+def test_text_tells_transform_outliers_and_reach_and_the_answer_at_its_head():
+    """Least squares cannot know wrong pairs, and a bent frame or few pairs are no "yes" either."""
     text = registration_report(found_of()).text()
     assert "40 point pairs, rigid, robust" in text
     assert "38 inliers, 2 outliers" in text
@@ -195,10 +187,6 @@ def test_text_tells_transform_outliers_and_reach():
     assert max(map(len, text.splitlines())) < 320
     few = registration_report(found_of(n=FEW_ROWS - 4)).text()
     assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", few)) == FEW_ROWS - 4
-
-
-def test_the_answer_is_at_the_head():
-    """Least squares cannot know wrong pairs, and a bent frame or few pairs are no "yes" either."""
     answers = {
         "Yes: inliers that are held out are missed by": found_of(),
         "With care: least squares takes every pair as right": found_of(wild=(), method="least-squares"),
@@ -209,7 +197,7 @@ def test_the_answer_is_at_the_head():
         assert registration_report(found).text().splitlines()[1].startswith(f"May I use it? {answer}")
 
 
-def test_rows_that_do_not_correspond_are_no_noise():
+def test_rows_that_do_not_correspond_are_no_noise_and_a_bent_frame_is_said():
     rng = np.random.default_rng(1)
     a = rng.uniform(-1000, 1000, (40, 3))
     b = 0.5 * a + rng.normal(0, 200, a.shape)
@@ -217,9 +205,6 @@ def test_rows_that_do_not_correspond_are_no_noise():
     text = registration_report(found).text()
     assert "no systematic residuals" not in text
     assert "do not use this transform" in text
-
-
-def test_a_bent_frame_is_said():
     text = registration_report(found_of(n=90, bend=0.6, allow_ambiguous=True)).text()
     assert "residuals are systematic" in text
     assert re.search(r"fitted in the cube of \d+ mm it holds within [\d.]+ mm there, [\d.]+ mm to \d+ mm", text)
@@ -247,7 +232,7 @@ def test_json_is_the_result(model):
     np.testing.assert_allclose(content["scales"], 1, atol=2e-3)
 
 
-def test_page_shows_outliers_and_escapes_names():
+def test_pages_show_outliers_escape_names_and_have_three_points():
     page = registration_report(found_of(), [Section("One <more>", ["section"])]).page()
     assert "pairs &lt;a&amp;b&gt;.csv" in page
     assert "<a&b>" not in page
@@ -258,9 +243,6 @@ def test_page_shows_outliers_and_escapes_names():
     order = [page.index(f'id="{key}"') for key in sections]
     assert order == sorted(order)
     assert "OUTLIER</td>" in page[page.index('id="rows"') :]
-
-
-def test_page_of_three_points():
     page = registration_report(found_of(n=3, wild=())).page()
     assert "Too few points to tell" in page
     assert page.count("data:image/svg+xml;base64,") == 1

@@ -1,20 +1,10 @@
 import pytest
 
-from stcal.cli.main import main
 from stcal.robot import load_robot, read_measurements
-from tests.outcome import Outcome, ended
+from tests.outcome import program
 from tests.scripts import load_script
 
-
-@pytest.fixture
-def stcal_robot(monkeypatch, capsys):
-    """``stcal robot`` as it is called: exit code, what it printed, and its errors."""
-
-    def call(*arguments) -> Outcome:
-        monkeypatch.setattr("sys.argv", ["stcal", "robot", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
+stcal_robot = program("stcal", "robot")
 
 
 @pytest.fixture

@@ -12,11 +12,8 @@ from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.robot_model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
+from tests.shared import write_rows
 from tests.support.arms import TOOL, WORLD
-
-
-def table(path, header, rows) -> None:
-    path.write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]) + "\n")
 
 
 @pytest.mark.full
@@ -30,11 +27,11 @@ def test_the_example_of_the_docstring_runs(tmp_path, monkeypatch, capsys):
     for name, q in (("measured", joint_vectors(nominal, 40, rng)), ("sweeps", sweeps)):
         seen = measured(true, q, rng, 0.03, 1e-4).poses()
         rows = [[*joint_cells(nominal, joint), *pose_cells(pose)] for joint, pose in zip(q, seen, strict=True)]
-        table(tmp_path / f"{name}.csv", [*joint_columns(nominal), *POSE], rows)
+        write_rows(tmp_path / f"{name}.csv", [*joint_columns(nominal), *POSE], rows)
     poses = robot.forward(true, joint_vectors(nominal, 10, rng))
-    table(tmp_path / "targets.csv", POSE, map(pose_cells, poses))
+    write_rows(tmp_path / "targets.csv", POSE, map(pose_cells, poses))
     there = np.hstack([poses.translation, poses.translation + rng.normal(0, 0.05, (10, 3))])
-    table(tmp_path / "verified.csv", [*(f"commanded_{name}" for name in POSE[:3]), *POSE[:3]], there)
+    write_rows(tmp_path / "verified.csv", [*(f"commanded_{name}" for name in POSE[:3]), *POSE[:3]], there)
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(textwrap.dedent(robot.__doc__.split("::\n", 1)[1]), "example", "exec"), names)

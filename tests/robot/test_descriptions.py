@@ -7,19 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Rigid
-from stcal.robot.descriptions import (
-    LINKS,
-    load_universal,
-    load_urdf,
-    require_urdf_written,
-    robot_urdf,
-)
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.robot.descriptions import LINKS, load_universal, load_urdf, require_urdf_written, robot_urdf
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.robot_file import load_robot, robot_toml, save_robot
 from stcal.robot.kinematics.robot_model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
 from tests.outcome import refuses
+from tests.shared import written
 from tests.support.arms import two_arms
 
 UR5E = {
@@ -101,15 +96,14 @@ def nominal(**more):
     return Robot("ur10", "standard", rows, (Joint(),) * 6, **{"tools": {"": Rigid()}, **more})
 
 
-def poses(robot):
-    return np.array([(robot.world_from_base @ pose).matrix() for pose in forward(robot, Q)])
+def world_poses(robot: Robot, q: np.ndarray, tool: str = "") -> Poses:
+    return robot.world_from_base @ forward(robot, q, tool)
 
 
 @pytest.fixture
 def universal(tmp_path):
     def read(text: str, *more, name: str = "ur.yaml"):
-        (tmp_path / name).write_text(text)
-        return load_universal(tmp_path / name, *more)
+        return load_universal(written(tmp_path / name, text), *more)
 
     return read
 
@@ -117,7 +111,7 @@ def universal(tmp_path):
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 def test_the_yaml_of_ur_calibration(universal, convention):
     found = universal(yaml_of(UR5E), None, convention)
-    np.testing.assert_allclose(poses(found.robot), [by_links(q) for q in Q], atol=ROUNDING_MM)
+    np.testing.assert_allclose(world_poses(found.robot, Q).matrix(), [by_links(q) for q in Q], atol=ROUNDING_MM)
     assert "its flange is 0.0013 mm off" in found.notes[0]  # by yaw of 1e-6 in the upper arm, on 0.9 m
     if convention == "standard":
         # the program makes the upper arm of a length, a twist and the next zero: a row, by angles about turned axes
@@ -125,13 +119,20 @@ def test_the_yaml_of_ur_calibration(universal, convention):
         assert found.robot.rows[1].theta == pytest.approx(UR5E["upper_arm"][5], abs=1e-12)
 
 
-def test_calibration_conf(universal):
+def test_calibration_conf_and_other_files_of_robots_which_are_to_be_converted(universal, tmp_path):
     """Tools and base of the nominal arm stay; with the nominal lengths in it: `tests/test_python_functions.py`."""
     base, tool = Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([0.3, 0, 0, 0, 0, 90.0])
     robot = universal(CONF, nominal(world_from_base=base, tools={"": tool}), name="calibration.conf").robot
     wanted = [base.matrix() @ by_rows(q) @ tool.matrix() for q in Q]
-    np.testing.assert_allclose(poses(robot), wanted, atol=ROUNDING_MM)
+    np.testing.assert_allclose(world_poses(robot, Q).matrix(), wanted, atol=ROUNDING_MM)
     assert max(max(abs(row.a), abs(row.d)) for row in robot.rows) < 1000  # and none of 92 m
+    for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
+        path = written(tmp_path / name, yaml_of(UR5E))
+        refuses(f"E-ROBOT-FORM … {name} … robot convert", load_robot, path)
+    robot = universal(yaml_of(UR5E)).robot
+    save_robot(tmp_path / "ur.toml", robot)
+    again, here = (world_poses(each, Q).matrix() for each in (load_robot(tmp_path / "ur.toml"), robot))
+    np.testing.assert_allclose(again, here, atol=ROUNDING_MM)
 
 
 @pytest.mark.parametrize(
@@ -149,19 +150,8 @@ def test_mistakes_in_files_of_universal_robots(universal, text, given, error):
     refuses(error, universal, text, given)
 
 
-def test_other_files_of_robots_are_to_be_converted(tmp_path, universal):
-    for name in ("ur.yaml", "calibration.conf", "arm.urdf"):
-        (tmp_path / name).write_text(yaml_of(UR5E))
-        refuses(f"E-ROBOT-FORM … {name} … robot convert", load_robot, tmp_path / name)
-    robot = universal(yaml_of(UR5E)).robot
-    save_robot(tmp_path / "ur.toml", robot)
-    np.testing.assert_allclose(poses(load_robot(tmp_path / "ur.toml")), poses(robot), atol=ROUNDING_MM)
-
-
 TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}
 WORLD = Rigid.exp([0.1, 0.2, 0.3, 1000, -500, 200])
-
-
 EXAMPLE = replace(mh80(), tools=TOOLS, world_from_base=WORLD)
 SLIDE = Joint("prismatic", -100.0, 2000.0)
 
@@ -187,21 +177,15 @@ def values(robot: Robot, m: int = 50) -> np.ndarray:
     return np.random.default_rng(9).uniform(-3, 3, (m, len(robot.rows))) * np.where(robot.prismatic, 300, 1)
 
 
-def world_poses(robot: Robot, q: np.ndarray, tool: str):
-    return robot.world_from_base @ forward(robot, q, tool)
-
-
 @pytest.mark.parametrize(
     ("name", "convention"),
     [*((name, "standard") for name in ROBOTS), ("example", "modified"), ("prismatic", "modified")],
 )
 def test_there_and_back(name, convention, tmp_path):
     robot = ROBOTS[name]
-    (tmp_path / "a.urdf").write_text(robot_urdf(robot))
-    found = load_urdf(tmp_path / "a.urdf", convention=convention)
-    (tmp_path / "b.toml").write_text(robot_toml(found.robot))
+    found = load_urdf(written(tmp_path / "a.urdf", robot_urdf(robot)), convention=convention)
     q = values(robot)
-    for back in (found.robot, load_robot(tmp_path / "b.toml")):
+    for back in (found.robot, load_robot(written(tmp_path / "b.toml", robot_toml(found.robot)))):
         assert back.convention == convention
         for tool in TOOLS:
             off = world_poses(back, q, tool).difference(world_poses(robot, q, tool))
@@ -220,8 +204,7 @@ def test_coupled_joints_are_kinematic_ones(tmp_path):
     coupling = np.eye(6)
     coupling[2, 1] = 1.0
     robot = replace(EXAMPLE, coupling=coupling)
-    (tmp_path / "a.urdf").write_text(robot_urdf(robot))
-    found = load_urdf(tmp_path / "a.urdf").robot
+    found = load_urdf(written(tmp_path / "a.urdf", robot_urdf(robot))).robot
     q = values(robot)
     off = forward(found, q @ coupling.T).difference(forward(robot, q))
     assert np.abs(off[:, 3:]).max() < 1e-9
@@ -229,11 +212,14 @@ def test_coupled_joints_are_kinematic_ones(tmp_path):
     assert (low, high) == pytest.approx((-90 - 80, 155 + 90))
 
 
-def test_a_file_that_leads_elsewhere_is_refused(tmp_path):
+def test_a_file_that_leads_elsewhere_and_robots_that_a_urdf_cannot_hold_are_refused(tmp_path):
     text = robot_urdf(EXAMPLE)
     assert text.count('xyz="0.145 0.0 0.54"') == 1
-    (tmp_path / "a.urdf").write_text(text.replace('xyz="0.145 0.0 0.54"', 'xyz="0.14501 0.0 0.54"'))
-    refuses("E-WRITTEN-DIFFERS … a.urdf", require_urdf_written, tmp_path / "a.urdf", EXAMPLE)
+    path = written(tmp_path / "a.urdf", text.replace('xyz="0.145 0.0 0.54"', 'xyz="0.14501 0.0 0.54"'))
+    refuses("E-WRITTEN-DIFFERS … a.urdf", require_urdf_written, path, EXAMPLE)
+    refuses("E-ROBOT-NAME … '\\x1b[31mred' has control characters", robot_urdf, replace(EXAMPLE, name="\x1b[31mred"))
+    none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
+    refuses("E-ROBOT-ELASTICITY", robot_urdf, replace(EXAMPLE, elasticity=none))
 
 
 OTHER = """<?xml version="1.0" ?>
@@ -283,9 +269,8 @@ def urdf_pose(q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_a_file_of_another_program(tmp_path, convention):
-    path = tmp_path / "other.urdf"
-    path.write_text(OTHER)
+def test_a_file_of_another_program_and_two_arms_that_come_back(tmp_path, convention):
+    path = written(tmp_path / "other.urdf", OTHER)
     found = load_urdf(path, convention=convention)
     assert (found.joints, found.from_link, found.to_link) == (("a1", "a2", "slide", "a4"), "base_link", "tool0")
     assert found.notes == ("joint a4 has no limits",)
@@ -297,6 +282,16 @@ def test_a_file_of_another_program(tmp_path, convention):
         assert np.abs(pose.matrix() - urdf_pose(each)).max() < 1e-9
     part = load_urdf(path, "l1", "plate", convention)
     assert part.joints == ("a2", "slide")
+    robot = two_arms(convention)
+    path = written(tmp_path / "a.urdf", robot_urdf(robot))
+    require_urdf_written(path, robot)
+    found = load_urdf(path, "", ["tool_left", "tool_right"], convention).robot
+    assert len(found.rows) == 14
+    assert sorted(found.tree.mounts) == [8]
+    q = joint_vectors(robot, 5, np.random.default_rng(0))
+    for name in ("left", "right"):
+        off = world_poses(found, q, f"tool_{name}").difference(world_poses(robot, q, name))
+        assert np.abs(off).max() < 1e-9
 
 
 GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4"/><child link="grip"/></joint>'
@@ -326,33 +321,11 @@ GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4
     ],
 )  # fmt: skip
 def test_mistakes_are_named(tmp_path, change, options, words):
-    path = tmp_path / "other.urdf"
-    path.write_text(OTHER.replace(*change, 1))
+    path = written(tmp_path / "other.urdf", OTHER.replace(*change, 1))
     with pytest.raises(InputError) as caught:
         load_urdf(path, **options)
     assert words in str(caught.value)
     assert str(caught.value).startswith(f"URDF {path}: ")
-
-
-def test_robots_that_a_urdf_cannot_hold_are_refused():
-    refuses("E-ROBOT-NAME … '\\x1b[31mred' has control characters", robot_urdf, replace(EXAMPLE, name="\x1b[31mred"))
-    none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
-    refuses("E-ROBOT-ELASTICITY", robot_urdf, replace(EXAMPLE, elasticity=none))
-
-
-@pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_two_arms_come_back_from_a_urdf(tmp_path, convention):
-    robot = two_arms(convention)
-    text = robot_urdf(robot)
-    (tmp_path / "a.urdf").write_text(text)
-    require_urdf_written(tmp_path / "a.urdf", robot)
-    found = load_urdf(tmp_path / "a.urdf", "", ["tool_left", "tool_right"], convention).robot
-    assert len(found.rows) == 14
-    assert sorted(found.tree.mounts) == [8]
-    q = joint_vectors(robot, 5, np.random.default_rng(0))
-    for name in ("left", "right"):
-        wanted = robot.world_from_base @ forward(robot, q, name)
-        assert np.abs((found.world_from_base @ forward(found, q, f"tool_{name}")).difference(wanted)).max() < 1e-9
 
 
 TWO_ARMS = """<robot name="cell"><link name="world"/>
@@ -367,18 +340,15 @@ ARM = """<link name="{arm}_base"/><link name="{arm}_1"/><link name="{arm}_2"/><l
 """
 
 
-def test_two_arms_that_stand_at_two_places(tmp_path):
+def test_two_arms_that_stand_at_two_places_and_links_in_a_circle_which_are_refused(tmp_path):
     """Each fixed to the world by a joint of its own: the tool of either is where its own mount puts it."""
     arms = "".join(ARM.format(arm=arm, x=x) for arm, x in (("left", 1.0), ("right", -2.0)))
-    (tmp_path / "cell.urdf").write_text(TWO_ARMS.format(arms=arms))
-    robot = load_urdf(tmp_path / "cell.urdf", to_link=["left_tool", "right_tool"]).robot
+    path = written(tmp_path / "cell.urdf", TWO_ARMS.format(arms=arms))
+    robot = load_urdf(path, to_link=["left_tool", "right_tool"]).robot
     for tool, x in (("left_tool", 1.0), ("right_tool", -2.0)):
         (pose,) = world_poses(robot, np.zeros((1, 4)), tool)
         expected = np.array([1000 * x + 700 * np.cos(x), 700 * np.sin(x), 800.0])
         assert pose.translation == pytest.approx(expected, abs=1e-6)
-
-
-def test_links_in_a_circle_are_refused(tmp_path):
     circle = ARM.format(arm="a", x=0.0).replace('<parent link="world"/>', '<parent link="a_tool"/>')
-    (tmp_path / "circle.urdf").write_text(TWO_ARMS.format(arms=circle))
-    refuses("E-URDF-LINKS … is below itself", load_urdf, tmp_path / "circle.urdf", from_link="a_base")
+    path = written(tmp_path / "circle.urdf", TWO_ARMS.format(arms=circle))
+    refuses("E-URDF-LINKS … is below itself", load_urdf, path, from_link="a_base")

@@ -1,7 +1,6 @@
 """From poses of the target in photographs to joint values: simulated poses, no pixels; with photographs in
 ``tests/test_chain.py``."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows import from_photos as work
 from stcal.workflows.from_photos import FromPhotos, files_of, story
 from tests.outcome import refuses
+from tests.shared import write_rows
 from tests.support.arms import targets
 from tests.support.image_poses import known_target, see
 
@@ -92,7 +92,7 @@ def swept(cell):
 
 
 @pytest.mark.slow
-def test_each_model_errs_less_than_the_one_before_and_its_sigma_is_told(cell, swept):
+def test_each_model_errs_less_than_the_one_before_and_its_files_are_read_by_the_next_step(cell, swept, tmp_path):
     drawn, axes, same, held = (figures.rms for figures in swept.errors.values())
     assert drawn > 5 * held  # 0.5 mm and 1 mrad, of which base and tool take up a part
     assert axes < drawn / 2
@@ -109,10 +109,6 @@ def test_each_model_errs_less_than_the_one_before_and_its_sigma_is_told(cell, sw
     said = story(swept)
     assert any("axis method" in line and line.startswith("every joint is swept") for line in said)
     assert any(f"{sigma.min():.2g} to {sigma.max():.2g} mm" in line for line in said)
-
-
-@pytest.mark.slow
-def test_files_are_read_by_the_next_step(tmp_path, swept):
     save_folder(tmp_path / "arm", files_of(swept))
     work.require_files_written(tmp_path / "arm", swept)
     steps = {"poses": "csv", "axes": "toml", "identified": "toml", "compensated": "csv"}
@@ -152,9 +148,7 @@ def given(tmp_path, monkeypatch, photographed):
         (tmp_path / f"views/a/{i:03d}.png").write_bytes(b"")
 
     def call(header, rows, robot=None, key="image", images="views", targets=None):
-        with (tmp_path / "log.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([header, *rows])
-        log, arm = tmp_path / "log.csv", mh80() if robot is None else robot
+        log, arm = write_rows(tmp_path / "log.csv", header, rows), mh80() if robot is None else robot
         work.robot_from_photos(tmp_path / images, scene.camera, target, scene.target, log, arm, targets, key=key)
 
     def unwanted(*_):
@@ -205,31 +199,21 @@ def test_what_is_refused(given, head, rows, options, error):
     refuses(error, given, head, rows, **options)
 
 
-def test_joint_values_by_another_column_are_those_of_the_photographs(tmp_path):
+def test_joint_values_by_another_column_and_a_place_that_cannot_be_filled(tmp_path):
     """A column ``image`` beside the one of ``--key`` means something else."""
     rows = [[f"a/{i}.png", f"other-{i}", *range(6)] for i in range(3)]
-    with (tmp_path / "log.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["photo", "image", *JOINTS], *rows])
-    found = work.read_joints(tmp_path / "log.csv", "photo", ["a/1.png", "a/2.png"], mh80())
+    log = write_rows(tmp_path / "log.csv", ["photo", "image", *JOINTS], rows)
+    found = work.read_joints(log, "photo", ["a/1.png", "a/2.png"], mh80())
     assert found.text("image") == ["a/0.png", "a/1.png", "a/2.png"]
     assert "photo" not in found
-
-
-@pytest.mark.parametrize("place", ["views", "views/a/new", "full", "file.toml", "file.toml/new"])
-def test_a_place_that_cannot_be_filled(tmp_path, place):
-    (tmp_path / "views/a").mkdir(parents=True)
-    (tmp_path / "views/a/1.png").write_bytes(b"")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full/identified.toml").write_text("mine")
-    (tmp_path / "file.toml").write_text("robot")
+    for name in ("views/a/1.png", "full/identified.toml", "file.toml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("mine")
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError, match="give another place"):
-        require_new_folder(tmp_path / place, tmp_path / "views")
+    for place in ("views", "views/a/new", "full", "file.toml", "file.toml/new"):
+        with pytest.raises(InputError, match="give another place"):
+            require_new_folder(tmp_path / place, tmp_path / "views")
     require_new_folder(tmp_path / "new/deep", tmp_path / "views")
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_all_files_are_written_or_none(tmp_path):
     with pytest.raises((InputError, OSError)):
         save_folder(tmp_path / "arm", {"poses.csv": "a", "n" * 300: "too long a name"})
-    assert list(tmp_path.iterdir()) == []
+    assert sorted(tmp_path.rglob("*")) == before

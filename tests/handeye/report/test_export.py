@@ -15,12 +15,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.handeye_file import FORMS, opencv_yaml, tree, urdf_joint
 from stcal.io.static_transforms import Static, messages
-from tests.outcome import fails_with
-from tests.support.static_transforms import (
-    pose_of_metres,
-    read_messages,
-    read_ros2_launch,
-)
+from tests.outcome import refuses
+from tests.shared import written
+from tests.support import static_transforms
+from tests.support.static_transforms import pose_of_metres
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
 
@@ -40,8 +38,7 @@ def text_of(result: HandEye, form: str, name: str = "handeye", **frames: str) ->
 def test_opencv(setup, tmp_path):
     pose, covariance = Rigid.exp([0.3, -2, 1, 12.5, -900, 3]), np.diag([1e-8, 2e-8, 3e-8, 0.01, 0.02, 0.03])
     result = result_of(pose, setup, covariance)
-    path = tmp_path / "handeye.yaml"
-    path.write_text(opencv_yaml(result))
+    path = written(tmp_path / "handeye.yaml", opencv_yaml(result))
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     for name, transform in result.transforms.items():
         assert (file.getNode(name).mat() == transform.matrix()).all()
@@ -73,11 +70,8 @@ def read_urdf(text: str) -> list[Static]:
 
 
 READERS = {
-    "ros2": read_ros2_launch,
-    "easy-handeye": read_easy,
-    "easy-handeye2": read_easy,
-    "ros": read_messages,
-    "urdf": read_urdf,
+    **{"ros2": static_transforms.read_ros2_launch, "ros": static_transforms.read_messages},
+    **{"easy-handeye": read_easy, "easy-handeye2": read_easy, "urdf": read_urdf},
 }
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 0.01, 0.04, 0.09])
 LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
@@ -118,10 +112,8 @@ def test_the_link_has_the_optical_frame_in_it(form):
 
 
 def test_names_of_frames():
-    with fails_with("E-FRAME-NAME … 'tool0'"):
-        tree(result_of(Rigid()), "tool0", "tool0")
-    with fails_with("E-OPTION-FORM … --export … staubli … ros2"):
-        exports_of(["staubli=flange.txt"], FORMS)
+    refuses("E-FRAME-NAME … 'tool0'", tree, result_of(Rigid()), "tool0", "tool0")
+    refuses("E-OPTION-FORM … --export … staubli … ros2", exports_of, ["staubli=flange.txt"], FORMS)
     for setup, own, other, beyond in (
         ("eye-in-hand", "robot_effector_frame", "robot_base_frame", "base"),
         ("eye-to-hand", "robot_base_frame", "robot_effector_frame", "flange"),

@@ -103,9 +103,11 @@ def test_a_tracker_that_moved_between_two_rows_is_located():
     assert "column station" in note
 
 
-def true_axes(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(frames, robot: Robot) -> np.ndarray:
+    """Of all axes of a true robot, one after the other."""
     rotation, origin = joint_frames(robot.chain(), np.zeros((1, len(robot.rows))))
-    return rotation[:, 0, :, 2], origin[:, 0]
+    pairs = zip(frames, rotation[:, 0, :, 2], origin[:, 0], robot.prismatic, strict=True)
+    return np.concatenate([axis_error(*each) for each in pairs])
 
 
 def axis_error(frame: Rigid, z: np.ndarray, origin: np.ndarray, sliding: bool) -> np.ndarray:
@@ -120,7 +122,6 @@ def axis_error(frame: Rigid, z: np.ndarray, origin: np.ndarray, sliding: bool) -
 def test_errors_of_axes_and_pairs_are_as_large_as_their_covariance(name, rests):
     nominal = NOMINALS[name]()
     true = arm(nominal)
-    z, origin = true_axes(true)
     q = sweep_values(true, 7 if rests == 1 else 5, rests)
     arcs, _ = find_arcs(measured(true, q), nominal)
 
@@ -134,8 +135,7 @@ def test_errors_of_axes_and_pairs_are_as_large_as_their_covariance(name, rests):
     squares, coordinates, scores = [], [], []
     for seed in range(100):
         fits, covariance, frames, pairs = fitted(SIGMA, seed)
-        error = [axis_error(f, z[i], origin[i], nominal.prismatic[i]) for i, f in enumerate(frames)]
-        error = np.concatenate(error)
+        error = errors_of(frames, true)
         squares.append(error @ np.linalg.solve(covariance, error) / len(error))
         coordinates.append([fit.sigma_mm / SIGMA for fit in fits])
         for one, two in zip(pairs, wanted, strict=True) if name == "MH80" else ():  # others cross: signs are not kept
@@ -176,13 +176,6 @@ def test_a_value_in_another_joints_column_is_named_not_the_axis(swept):
     assert [row.d for row in found.robot.rows] == pytest.approx([row.d for row in clean.robot.rows], abs=0.2)
 
 
-def test_a_row_without_a_target_is_named(swept):
-    names = list(swept.targets)
-    names[40] = ""
-    notes = robot_from_sweeps(replace(swept, targets=tuple(names)), mh80()).notes
-    assert any(f"line {swept.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
-
-
 @pytest.mark.parametrize("off_mm", sampled([0.5, 20.0, 300.0, 2000.0]))
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
@@ -197,32 +190,31 @@ def test_a_gross_error_is_named_and_left_out(off_mm):
         assert abs(one.distance_mm - two.distance_mm) < 3 * two.distance_sigma_mm  # one of 18 points less
 
 
-def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing():
+def test_a_reflector_on_the_axis_says_nothing_and_a_row_without_a_target_is_named(swept):
     nominal = mh80()
     true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})
     result = robot_from_sweeps(measured(true, sweep_values(nominal), SIGMA), nominal)
     assert [arc.target for arc in result.fits[5].near] == ["D"]
     assert "reflector D: too close to the axis of joint 6" in result.notes[0]
-    z, origin = true_axes(true)
-    error = axis_error(result.fits[5].world_from_axis, z[5], origin[5], False)
+    error = errors_of([fit.world_from_axis for fit in result.fits], true)[-4:]
     assert np.abs(error[2:]).max() < 5 * np.sqrt(np.diag(result.fits[5].covariance)[2:].max())
     alone = replace(true, tools={"D": true.tools["D"]})
     refuses("E-AXES-UNDETERMINED … 6:", robot_from_sweeps, measured(alone, sweep_values(nominal), SIGMA), nominal)
-
-
-@pytest.mark.parametrize("shift", [0.0, 0.004, -0.004])
-def test_positions_about_a_full_turn_are_one_with_any_limit(shift):
-    """At −0.3°, 0.1° and 359.9° a joint stands at one place, where it may stray by 1°."""
-    true = scara()
-    q = np.tile([0.2, 0.1, 30.0, 0.0], (4, 1))
-    q[:, 0] = [shift - 0.005, shift + 0.002, shift + 2 * np.pi - 0.002, 1.0]
-    data = measured(arm(true), np.vstack([q, sweep_values(true)]))
-    arcs, notes = find_arcs(data, true, np.radians(1.0))
-    assert sum("an arc of 2 positions is not used" in note for note in notes) == 3  # of each reflector
-    assert not any(arc.rows[0] == 0 for arc in arcs)
+    names = list(swept.targets)
+    names[40] = ""
+    notes = robot_from_sweeps(replace(swept, targets=tuple(names)), mh80()).notes
+    assert any(f"line {swept.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
 
 
 def test_full_turns_and_arcs_too_short_to_use():
+    """At −0.3°, 0.1° and 359.9° a joint stands at one place, where it may stray by 1°."""
+    true, q = scara(), np.tile([0.2, 0.1, 30.0, 0.0], (4, 1))
+    for shift in (0.0, 0.004, -0.004):
+        q[:, 0] = [shift - 0.005, shift + 0.002, shift + 2 * np.pi - 0.002, 1.0]
+        data = measured(arm(true), np.vstack([q, sweep_values(true)]))
+        arcs, notes = find_arcs(data, true, np.radians(1.0))
+        assert sum("an arc of 2 positions is not used" in note for note in notes) == 3  # of each reflector
+        assert not any(arc.rows[0] == 0 for arc in arcs)
     true = arm(mh80())
     q = sweep_values(true, 5)
     turned, two = np.repeat(q[:1], 4, axis=0), np.repeat(q[:1], 2, axis=0)
@@ -265,13 +257,20 @@ def test_the_arms_that_cannot_be_had(swept):
     refuses("E-AXES-JOINT-VALUES", robot_from_sweeps, replace(good, q=np.radians(good.q)), nominal, 1e-6)
 
 
-def test_exactly_parallel_axes_have_no_common_normal():
+def test_exactly_parallel_axes_have_no_common_normal_and_both_errors_are_alike_at_the_length():
     nominal = mh80()
     result = robot_from_sweeps(measured(placed(nominal, Rigid(), TOOLS), sweep_values(nominal)), nominal)
     pair = result.pairs[1]
     assert pair.parallel
     assert pair.distance_mm == pytest.approx(870, abs=1e-8)
     assert pair.refused
+    true = arm(mh80())
+    data = posed(true, sweep_values(true, 3))
+    assert length_of(data) == pytest.approx(LENGTH_MM)
+    assert length_of(replace(data, covariance=None)) is None
+    with fails_with("E-MEASURED-NO-ORIENTATION"):
+        robot_from_sweeps(measured(true, sweep_values(true, 3)), nominal, places=ring(100.0))
+    refuses("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000", ring, 0.1)
 
 
 def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(shared_data, tmp_path):
@@ -283,8 +282,7 @@ def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(shared_da
     nominal = load_robot(tmp_path / "fanuc.toml")
     result = robot_from_sweeps(read_measurements(tmp_path / "fanuc.csv", nominal), nominal)
     rms = [np.sqrt((fit.lengths() ** 2).mean()) for fit in result.fits]  # of the points' vectors
-    assert min(rms) > 0.02
-    assert max(rms) < 0.04
+    assert 0.02 < min(rms) <= max(rms) < 0.04
     assert [len(fit.rows) for fit in result.fits] == [18] * 6
     assert not result.notes
     for pair, wanted in zip(result.pairs, (311.45, 1075.58, 226.08), strict=False):
@@ -302,8 +300,7 @@ def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(shared_da
     assert [p.refused for p in result.pairs if p.joint != 2] == [""] * 4
     distance, normal = (result.without_one.spread(key)[1] for key in ("distance", "normal"))
     assert len(result.without_one.lines) == 36
-    assert 0.005 < distance < 0.1
-    assert normal > 100
+    assert 0.005 < distance < 0.1 < 100 < normal
 
 
 LENGTH_MM = 150.0
@@ -333,16 +330,6 @@ def test_orientations_give_the_pose_of_the_target_too():
     assert np.abs(here.difference(there)[:, :3]).max() < 1e-10
 
 
-def test_the_length_is_that_at_which_both_errors_are_alike():
-    true = arm(mh80())
-    data = posed(true, sweep_values(true, 3))
-    assert length_of(data) == pytest.approx(LENGTH_MM)
-    assert length_of(replace(data, covariance=None)) is None
-    with fails_with("E-MEASURED-NO-ORIENTATION"):
-        robot_from_sweeps(measured(true, sweep_values(true, 3)), mh80(), places=ring(100.0))
-    refuses("E-OPTION-RANGE … --orientations … 0.1 … 1 … 10000", ring, 0.1)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
 def test_orientations_help_and_their_covariance_is_true(places):
@@ -350,16 +337,12 @@ def test_orientations_help_and_their_covariance_is_true(places):
     share what the unwinding passes on. Points that share the errors of a pose are not taken for independent."""
     nominal = mh80()
     true = arm(nominal)
-    z, origin = true_axes(true)
     q = sweep_values(true, 5)
     squares, sizes = [], []
     for seed in range(40):
         data = posed(true, q, SIGMA, seed)
         found = [robot_from_sweeps(data, nominal, places=used) for used in (places, None)]
-        errors = [
-            np.concatenate([axis_error(f.world_from_axis, z[j], origin[j], False) for j, f in enumerate(r.fits)])
-            for r in found
-        ]
+        errors = [errors_of([fit.world_from_axis for fit in each.fits], true) for each in found]
         squares.append(errors[0] @ np.linalg.solve(found[0].covariance, errors[0]) / len(errors[0]))
         sizes.append([np.abs(each.reshape(-1, 4)[:, :2]).mean() for each in errors])
     assert 0.75 < np.mean(squares) < 1.35

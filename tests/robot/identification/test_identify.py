@@ -22,6 +22,7 @@ from stcal.robot.simulated import joint_vectors, measured, placed
 from tests.levels import sampled
 from tests.outcome import fails_with, refuses
 from tests.scripts import load_script
+from tests.shared import written
 from tests.support.arms import TOOL, WORLD, seen_arm
 
 pytestmark = pytest.mark.slow
@@ -52,21 +53,17 @@ def test_zeros_alone_are_found_and_nothing_else_moves():
     assert identify(mh80(), data[:4], IdentifyOptions(adjust="zeros", folds=0)).rank == 16
 
 
-def test_fixed_dimensions_stay_and_are_said(tmp_path):
+def test_fixed_dimensions_stay_and_are_said_and_names_of_what_is_adjusted(tmp_path):
     true, data = seen_arm(np.random.default_rng(2), 40)
     assert abs(true.rows[1].a - mh80().rows[1].a) > 0.01
     joints = list(mh80().joints)
     joints[1] = replace(joints[1], fixed={"a": "measured on a CMM"})
-    (tmp_path / "robot.toml").write_text(robot_toml(replace(mh80(), joints=tuple(joints))))
-    nominal = load_robot(tmp_path / "robot.toml")
+    nominal = load_robot(written(tmp_path / "robot.toml", robot_toml(replace(mh80(), joints=tuple(joints)))))
     assert nominal.joints[1].fixed == {"a": "measured on a CMM"}
     found = identify(nominal, data, IdentifyOptions(folds=2, repeats=1))
     assert found.robot.rows[1].a == pytest.approx(mh80().rows[1].a, abs=1e-3)
     assert any("a of row 2 (measured on a CMM)" in note for note in found.notes)
     assert found.all_held_out is not None
-
-
-def test_names_of_what_is_adjusted():
     for text in ("base,tool", "zeros", "geometry", "all"):
         assert adjusted(text) == text
     assert adjusted("tool, base") == "base,tool"
@@ -110,17 +107,14 @@ def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
     assert next(iter(found.state.stations)) == "A"
 
 
-def test_rows_of_another_station_and_a_station_of_two_rows_are_refused():
+def test_rows_of_another_station_and_of_two_rows_are_refused_and_distances_go_within_stations():
     data = stationed("position")
     names = list(data.stations)
     names[1:40:4] = ["A"] * len(names[1:40:4])
-    with fails_with("E-IDENTIFY-MISFIT … robot MH80 misses the measurements"):
-        identify(mh80(), replace(data, stations=tuple(names)))
+    wrong = replace(data, stations=tuple(names))
+    refuses("E-IDENTIFY-MISFIT … robot MH80 misses the measurements", identify, mh80(), wrong)
     refuses("E-STATION-FEW … 2", identify, mh80(), stationed("position", second=2))
-
-
-def test_distances_of_positions_go_within_stations():
-    found = identify(mh80(), stationed("position"), IdentifyOptions(observe="distance", folds=0))
+    found = identify(mh80(), data, IdentifyOptions(observe="distance", folds=0))
     assert found.rank == 21  # as from one station
     assert np.sqrt((found.fitted_mm**2).mean()) < 0.15
 
@@ -170,7 +164,8 @@ def drawn(rows: int, share: float, seed: int, observe: str = "pose"):
     return true, data if observe == "pose" else replace(data, rotations=None)
 
 
-def test_six_poses_for_thirty_parameters_are_said():
+def test_six_poses_for_thirty_parameters_and_rows_of_a_small_part_of_the_ranges_are_said():
+    """All parameters count as determined; what is least known is named with its σ."""
     found = identify(mh80(), drawn(6, 0.6, 0)[1], IdentifyOptions(repeats=1))
     assert found.rank == 30
     assert found.held_out is None
@@ -179,10 +174,6 @@ def test_six_poses_for_thirty_parameters_are_said():
     assert "times that at the measured rows" in found.notes[-1]
     more = identify(mh80(), drawn(8, 0.6, 0)[1], IdentifyOptions(folds=0))
     assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in more.notes)
-
-
-def test_rows_of_a_small_part_of_the_ranges_are_said_and_none_over_them():
-    """All parameters count as determined; what is least known is named with its σ."""
     found = identify(mh80(), drawn(40, 0.03, 1)[1], IdentifyOptions(folds=0))
     assert found.rank == 30
     assert rms(found.predicted.ranges_mm) > 20 * rms(found.predicted.here_mm)
@@ -232,15 +223,11 @@ def test_wrong_rows_over_many_draws(case):
     assert sum(good for *_, good in found) <= 1  # 4.03 σ of 1200 rows: of honest ones 1 in 10⁹ has half weight
 
 
-def test_without_the_search_wrong_rows_would_do_harm():
-    """The test above can fail: Huber's weights alone follow ten wrong rows of forty."""
+def test_without_the_search_wrong_rows_would_do_harm_and_most_rows_wrong_are_not_called_good():
+    """Huber's weights alone follow ten wrong rows of forty; where more than half err, σ hold it."""
     _, data, _ = study.simulated(CASES["position | 40 | 25% | 1–50"], 0)
     plain = identify(mh80(), data, IdentifyOptions(folds=0, robust=False))
     assert plain.weighting.sigma_mm > 20 * 0.05
-
-
-def test_most_rows_wrong_is_not_called_good():
-    """Where more than half err, what agrees is not the robot: σ hold it."""
     _, data, _ = study.simulated(CASES["position | 40 | 0% | –"], 1)
     rng = np.random.default_rng(0)
     away = np.where(rng.random((40, 1)) < 0.7, rng.normal(0, 20, (40, 3)), 0.0)

@@ -54,13 +54,26 @@ def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
     assert 0.05 < np.mean(squares) < 1.95
 
 
-def test_without_noise_the_arm_is_found_exactly():
+def test_without_noise_the_arm_is_found_exactly_and_one_whose_rows_are_singular_to_noise():
     true, data = simulated(1, 40, 0, 0)
     found = identify(mh80(), data, QUICK)
     q = joint_vectors(true, 50, np.random.default_rng(9))
     wanted, own = (flange_poses(robot.chain(), q) @ robot.tools[""] for robot in (true, found.robot))
     assert np.abs(wanted.difference(own)[:, 3:]).max() < 1e-7  # mm; rounding of 2 m over the condition of the data
     assert found.nominal_mm.mean() > 0.3
+    rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
+    arm = Robot("singular", "standard", rows, (Joint(),) * 6)
+    rng = np.random.default_rng(0)
+    q = joint_vectors(arm, 60, rng)
+    seen = flange_poses(arm.chain(), q)
+    positions = seen.translation + rng.normal(0, 0.05, (60, 3))
+    data = Measurements("d", range(2, 62), q, ("",) * 60, positions, seen.rotation)
+    found = identify(arm, data, replace(QUICK, sigma_mm=0.05, sigma_rad=1e-4))
+    assert found.rank == 30
+    # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
+    assert 0.06 < found.fitted_mm.mean() < 0.09
+    again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
+    assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 @pytest.mark.parametrize("tree", [False, True])
@@ -81,7 +94,7 @@ def test_derivatives_are_those_of_differences(kind, tree):
         )
 
 
-def test_held_out_error_is_that_of_new_poses():
+def test_held_out_error_is_that_of_new_poses_and_a_flat_direction_is_no_failure():
     true, data = simulated(5, 60)
     found = identify(mh80(), data, IdentifyOptions(repeats=1))
     assert found.ranks == {"pose": 30, "position": 27, "distance": 21}
@@ -92,6 +105,12 @@ def test_held_out_error_is_that_of_new_poses():
     expected = np.hypot(0.05 * np.sqrt(8 / np.pi), model.mean())
     assert found.held_out.position_mm.mean() == pytest.approx(expected, rel=0.25)
     assert found.held_out.position_mm.mean() > found.fitted_mm.mean()
+    # Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times.
+    study = load_script("identify_study")
+    case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
+    predicted, parameters = study.errors(case, 45)
+    assert 0.1 < predicted < 3  # mean of 49 squares, correlated
+    assert 0.3 < parameters < 2.2  # of 21 squares
 
 
 def squares(found: Identified, true: Robot, seed: int, kind: str = "position"):
@@ -125,15 +144,6 @@ def test_the_covariance_is_true(count):
     # Those of the rows are correlated: √(2 / 9) at the most or so.
     assert np.mean(errors) == pytest.approx(1, abs=3 * np.sqrt(2 / 27 / draws))
     assert np.mean(rows) == pytest.approx(1, abs=3 * np.sqrt(2 / 9 / draws))
-
-
-def test_a_flat_direction_is_no_failure():
-    """Distances of 30 points; along one direction every step gains a millionth of σ², a hundred times."""
-    study = load_script("identify_study")
-    case = next(case for case in study.CASES if (case.kind, case.rows) == ("distance", 30))
-    predicted, parameters = study.errors(case, 45)
-    assert 0.1 < predicted < 3  # mean of 49 squares, correlated
-    assert 0.3 < parameters < 2.2  # of 21 squares
 
 
 def test_an_outlier_is_named_and_does_no_harm():
@@ -178,22 +188,6 @@ def test_data_that_cannot_be_right_are_named(spoil, kind, words):
     _, data = simulated(8, 40)
     with pytest.raises(kind, match=words):
         identify(mh80(), spoil(data), QUICK)
-
-
-def test_an_arm_whose_rows_are_singular_is_identified():
-    rows = (*mh80().rows[:4], DHRow(0, 0, 0, 0), DHRow(0, 0, 175, 0))  # the last three axes on one line
-    arm = Robot("singular", "standard", rows, (Joint(),) * 6)
-    rng = np.random.default_rng(0)
-    q = joint_vectors(arm, 60, rng)
-    seen = flange_poses(arm.chain(), q)
-    positions = seen.translation + rng.normal(0, 0.05, (60, 3))
-    data = Measurements("d", range(2, 62), q, ("",) * 60, positions, seen.rotation)
-    found = identify(arm, data, replace(QUICK, sigma_mm=0.05, sigma_rad=1e-4))
-    assert found.rank == 30
-    # mean length of the noise is 1.6 σ = 0.08 mm, less what 30 parameters take up of 360 numbers
-    assert 0.06 < found.fitted_mm.mean() < 0.09
-    again = flange_poses(found.robot.chain(), q) @ found.robot.tools[""]
-    assert again.difference(found.state.tips(data.q, data.targets)) == pytest.approx(np.zeros((60, 6)), abs=1e-9)
 
 
 def test_rokae_held_out(rokae):

@@ -16,6 +16,7 @@ from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import measured
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from tests.outcome import fails_with, refuses
+from tests.shared import write_rows, written
 from tests.support.arms import seen_arm
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
@@ -23,11 +24,10 @@ POSES = Poses.of([Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([-0.4, 0, 0.3, 
 
 
 def read(tmp_path, text: str, robot: Robot = GANTRY) -> Measurements:
-    (tmp_path / "data.csv").write_text(text)
-    return read_measurements(tmp_path / "data.csv", robot)
+    return read_measurements(written(tmp_path / "data.csv", text), robot)
 
 
-def test_units_and_targets(tmp_path):
+def test_units_targets_and_distances_from_rows(tmp_path):
     data = read(tmp_path, "# a note\nq1_m,q2_deg,x_um,y_mm,z_in,target\n\n0.25,90,1000,2,1,N1\n0.5,-45,0,0,0,N2\n")
     assert data.q == pytest.approx(np.array([[250, np.pi / 2], [500, -np.pi / 4]]))
     assert data.positions == pytest.approx(np.array([[1, 2, 25.4], [0, 0, 0]]))
@@ -35,27 +35,21 @@ def test_units_and_targets(tmp_path):
     assert list(data.lines) == [4, 5]
     assert data.rotations is None
     refuses("E-MEASURED-NO-ORIENTATION", data.poses)
+    data = read(tmp_path, "q1_mm,q2_deg,distance_mm,from_row\n0,0,0,1\n10,5,20,1\n20,10,30,2\n")
+    assert data.distances == pytest.approx([0, 20, 30])
+    assert data.from_row.tolist() == [0, 0, 1]
+    assert read(tmp_path, "q1_mm,q2_deg,distance_mm\n0,0,0\n10,5,20\n").from_row.tolist() == [0, 0]
+    with fails_with("E-MEASURED-DISTANCES"):
+        data[:2]
 
 
-def test_poses_with_covariance(tmp_path):
+def test_poses_with_covariance_and_common_errors(tmp_path):
     covariance = np.diag([1e-8, 2e-8, 3e-8, 1e-4, 2e-4, 3e-4])
     rows = [["1", "2", *pose_cells(pose, covariance)] for pose in POSES]
     data = read(tmp_path, "\n".join(",".join(r) for r in [["q1_mm", "q2_rad", *POSE, *COVARIANCE], *rows]))
     assert np.abs(data.poses().difference(POSES)).max() < 1e-12
     assert data.covariance == pytest.approx(np.array([covariance] * 2))
     assert data[1:].covariance.shape == (1, 6, 6)
-
-
-def common_text(common, names=None):
-    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
-    covariance = np.diag([1e-8] * 3 + [1e-4] * 3)
-    columns = common_columns(common.shape[2]) if names is None else names
-    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
-    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
-    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
-
-
-def test_common_errors_of_poses(tmp_path):
     common = np.random.default_rng(0).normal(size=(2, 6, 3)) * 0.3 * np.repeat([1e-4, 1e-2], 3)[:, None]
     data = read(tmp_path, common_text(common))
     assert data.common == pytest.approx(common, rel=1e-5)
@@ -68,13 +62,13 @@ def test_common_errors_of_poses(tmp_path):
     refuses("E-TABLE-COVARIANCE", read, tmp_path, without)
 
 
-def test_distances_from_rows(tmp_path):
-    data = read(tmp_path, "q1_mm,q2_deg,distance_mm,from_row\n0,0,0,1\n10,5,20,1\n20,10,30,2\n")
-    assert data.distances == pytest.approx([0, 20, 30])
-    assert data.from_row.tolist() == [0, 0, 1]
-    assert read(tmp_path, "q1_mm,q2_deg,distance_mm\n0,0,0\n10,5,20\n").from_row.tolist() == [0, 0]
-    with fails_with("E-MEASURED-DISTANCES"):
-        data[:2]
+def common_text(common, names=None):
+    """Two poses with the covariance 1e-8 rad², 1e-4 mm² and common errors (2, 6, r)."""
+    covariance = np.diag([1e-8] * 3 + [1e-4] * 3)
+    columns = common_columns(common.shape[2]) if names is None else names
+    cells = [[f"{v:g}" for v in each.T.ravel()] for each in common]
+    rows = [["1", "2", *pose_cells(p, covariance), *c] for p, c in zip(POSES, cells, strict=True)]
+    return "\n".join(",".join(row) for row in [["q1_mm", "q2_deg", *POSE, *COVARIANCE, *columns], *rows])
 
 
 @pytest.mark.parametrize(
@@ -124,8 +118,7 @@ class Data:
         save_robot(folder / "robot.toml", mh80())
 
     def write(self, name: str, names: tuple[str, ...], *more: str, poses=None, joints: bool = True):
-        header = [*(joint_columns(self.true) if joints else ()), *POSE[:3], *names, *more]
-        rows = [header]
+        header, rows = [*(joint_columns(self.true) if joints else ()), *POSE[:3], *names, *more], []
         for pose, q in zip(poses or self.seen.poses(), self.seen.q, strict=True):
             turn = pose_cells(pose)[3:] if names == POSE[3:] else []
             if names in ORDER:
@@ -133,9 +126,7 @@ class Data:
                 turn = [repr(float(angle)) for angle in angles]
             own = joint_cells(self.true, q) if joints else []
             rows.append([*own, *pose_cells(pose)[:3], *turn, *["1"] * len(more)])
-        path = self.folder / name
-        path.write_text("\n".join(map(",".join, rows)) + "\n")
-        return path
+        return write_rows(self.folder / name, header, rows)
 
 
 @pytest.fixture
@@ -154,11 +145,18 @@ def test_angles_are_orientations(data, names, rotation):
     assert targets.notes == read.notes
 
 
-def test_the_order_of_quaternions_is_an_option(data):
+def test_the_order_of_quaternions_is_an_option_and_columns_that_nothing_reads_are_named(data):
     wxyz = data.seen.poses().quaternions()
     path = data.write("data.csv", POSE[3:], poses=Poses.from_quaternions(wxyz[:, [1, 2, 3, 0]], data.seen.points()))
     read = read_measurements(path, mh80(), quaternions="xyzw")
     assert np.abs(read.poses().difference(data.seen.poses())).max() < 1e-9
+    known = ("station", "faces", "circles", "rms_px", "chi2_per_dof", "commanded_x_mm", "nominal_q1_deg", "name")
+    assert read_measurements(data.write("data.csv", POSE[3:], *known), mh80()).notes == ()
+    alone = read_measurements(data.write("data.csv", (), "temperature"), mh80())
+    assert alone.notes == ("column not read: temperature",)
+    both = ("columns not read: w_deg, p_deg, r_deg, load",)
+    assert read_measurements(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
+    assert read_targets(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
 
 
 def test_an_open_convention_is_refused_and_a_needless_one_too(data):
@@ -168,21 +166,9 @@ def test_an_open_convention_is_refused_and_a_needless_one_too(data):
         for names in (POSE[3:], ()):
             with fails_with("E-OPTION-NEEDS … --rotation … yaskawa"):
                 read(data.write("data.csv", names), mh80(), rotation="yaskawa")
-    (data.folder / "d.csv").write_text("q1_deg,distance_mm\n1,2\n")
-    with fails_with("E-OPTION-NEEDS"):
-        alone = Robot("one", "standard", mh80().rows[:1], mh80().joints[:1])
-        read_measurements(data.folder / "d.csv", alone, rotation="yaskawa")
-
-
-def test_columns_that_nothing_reads_are_named_and_the_known_ones_are_not(data):
-    known = ("station", "faces", "circles", "rms_px", "chi2_per_dof", "commanded_x_mm", "nominal_q1_deg", "name")
-    assert read_measurements(data.write("data.csv", POSE[3:], *known), mh80()).notes == ()
-    assert read_measurements(data.write("data.csv", (), "temperature"), mh80()).notes == (
-        "column not read: temperature",
-    )
-    both = ("columns not read: w_deg, p_deg, r_deg, load",)
-    assert read_measurements(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
-    assert read_targets(data.write("data.csv", POSE[3:], *WPR, "load"), mh80()).notes == both
+    alone, path = Robot("one", "standard", mh80().rows[:1], mh80().joints[:1]), data.folder / "d.csv"
+    distances = written(path, "q1_deg,distance_mm\n1,2\n")
+    refuses("E-OPTION-NEEDS", read_measurements, distances, alone, rotation="yaskawa")
 
 
 @pytest.mark.slow
@@ -202,10 +188,9 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
     assert code == 0
     assert json.loads(out.read_text())["notes"][:2] == [angles, "column not read: load"]
     assert f"note: targets {targets}: column not read: load" in printed
-    at = ["commanded_x_mm", "commanded_y_mm", "commanded_z_mm"]
-    lines = [",".join([*at, *POSE[:3], "load"]), *(f"{i},{i * i},0,{i},{i * i},0,1" for i in range(5))]
-    (data.folder / "v.csv").write_text("\n".join(lines) + "\n")
-    code, printed, _ = stcal_robot("verify", data.folder / "v.csv", "--json", out, "--overwrite")
+    head = [*(f"commanded_{name}" for name in POSE[:3]), *POSE[:3], "load"]
+    path = write_rows(data.folder / "v.csv", head, [[i, i * i, 0, i, i * i, 0, 1] for i in range(5)])
+    code, printed, _ = stcal_robot("verify", path, "--json", out, "--overwrite")
     assert "note: column not read: load" in printed
     assert json.loads(out.read_text())["notes"] == ["column not read: load"]
 

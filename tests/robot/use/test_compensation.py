@@ -21,6 +21,7 @@ from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import CompensationFile, compensate, compensated_csv, on_targets, robots_apart
 from tests.levels import sampled
 from tests.outcome import refuses
+from tests.shared import write_rows
 from tests.support.arms import elastic, scara, targets
 
 pytestmark = pytest.mark.slow
@@ -42,9 +43,7 @@ class Case:
         self.poses = forward(self.nominal, self.q)
 
     def write(self, header: Sequence[str], rows: list[list[str]]) -> Path:
-        path = self.folder / "targets.csv"
-        path.write_text("\n".join(",".join(r) for r in [header, *rows]) + "\n")
-        return path
+        return write_rows(self.folder / "targets.csv", header, rows)
 
     def read(self, header: Sequence[str], rows: list[list[str]]) -> Targets:
         return read_targets(self.write(header, rows), self.real)
@@ -61,7 +60,7 @@ def case(tmp_path):
     return Case(tmp_path)
 
 
-def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
+def test_joint_values_command_what_the_nominal_robot_makes_of_them_and_poses_need_none(case):
     result = compensate(case.real, targets(None, case.q), case.nominal)
     reached = forward(case.real, result.found.q)
     assert result.found.usable.all()
@@ -73,9 +72,6 @@ def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
     assert 0.5 < expected.mean() < 5
     # The same branch: others are about π away, and at the wrist 0.5 mrad over 8 mrad of bend are 0.1 rad.
     assert np.abs(result.found.q - case.q).max() < 1
-
-
-def test_poses_alone_need_no_nominal_robot(case):
     result = compensate(case.real, targets(case.poses[:FEW]))
     assert result.found.usable.all()
     assert len(result.before_mm) == 0
@@ -93,7 +89,8 @@ def test_joint_values_beside_poses_choose_the_branch(case):
     assert np.abs(found.q - flipped)[inside].max() < 0.1
 
 
-def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
+def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones_but_of_poses_of_the_flange(case):
+    """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
     given, bare = targets(None, case.q[:FEW]), replace(case.nominal, tools={"": Rigid()})
     found = compensate(case.real, given, bare)
     assert re.match(r"tool of the robot files differs by 151\.\d mm and 0° between .* taken in both", found.notes()[0])
@@ -102,24 +99,11 @@ def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case):
     np.testing.assert_allclose(found.found.q, both.found.q, atol=1e-9)
     nameless = compensate(case.real, given, replace(case.nominal, tools={"other": Rigid()})).notes()[0]
     assert "is not in the nominal file: that of the identified file is taken in both" in nameless
-
-
-def test_poses_of_the_nominal_files_tool_are_told_by_their_joint_values(case):
-    """Poses of the flange, with the joint values that the controller has there: the identified tool is not theirs."""
-    bare = replace(case.nominal, tools={"": Rigid()})
     flange = forward(bare, case.q)
-    found = compensate(case.real, targets(flange, case.q), bare)
-    assert "nominal file is taken in both (joint values beside the poses say so)" in found.notes()[0]
-    reached = forward(replace(case.real, tools={"": Rigid()}), found.found.q)
+    by_flange = compensate(case.real, targets(flange, case.q), bare)
+    assert "nominal file is taken in both (joint values beside the poses say so)" in by_flange.notes()[0]
+    reached = forward(replace(case.real, tools={"": Rigid()}), by_flange.found.q)
     np.testing.assert_allclose(reached.translation, flange.translation, atol=1e-8)
-
-
-def test_poses_of_which_none_is_reached_are_an_error(case, stcal_robot):
-    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
-    (case.folder / "identified.toml").write_text(robot_toml(case.real))
-    code, _, error = stcal_robot("compensate", case.write(POSE, far), "--robot", case.folder / "identified.toml")
-    assert code == 3
-    assert "none of 1 poses is reached" in error
 
 
 def test_every_tool_by_its_name(case):
@@ -137,7 +121,7 @@ def test_every_tool_by_its_name(case):
     refuses("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'", case.read, ["target", *JOINTS], rows)
 
 
-def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
+def test_what_is_not_reached_keeps_its_row_without_joint_values_and_none_of_all_is_an_error(case, stcal_robot):
     places = case.poses.translation[:FEW].copy()
     places[1] = [5000, 0, 0]
     result = compensate(case.real, targets(Poses(case.poses.rotation[:FEW], places)), case.nominal)
@@ -157,9 +141,15 @@ def test_what_is_not_reached_keeps_its_row_without_joint_values(case):
     content = CompensationFile.model_validate(result).content()
     assert content["found"]["status"].count("reached") == FEW - 1
     assert content["joints"][1] is None
+    far = [pose_cells(Rigid(p.rotation, p.translation + np.array([9000, 0, 0]))) for p in case.poses[:1]]
+    (case.folder / "identified.toml").write_text(robot_toml(case.real))
+    code, _, error = stcal_robot("compensate", case.write(POSE, far), "--robot", case.folder / "identified.toml")
+    assert code == 3
+    assert "none of 1 poses is reached" in error
 
 
-def test_limits_of_the_controller_are_respected(case):
+def test_limits_of_the_controller_are_respected_and_a_long_way_near_a_singularity_is_told(case):
+    """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     joints = [Joint("revolute", q - 1e-5, q + 1e-5) for q in case.q[0]]
     tight = replace(case.real, joints=tuple(joints))
     result = compensate(tight, targets(None, case.q[:1]), case.nominal)
@@ -167,6 +157,11 @@ def test_limits_of_the_controller_are_respected(case):
     assert np.abs(result.found.q[0] - case.q[0]).max() <= 1e-5 + 1e-9
     assert 0.1 < result.found.error_mm[0] < result.before_mm[0]
     assert "beyond the limits" in result.notes()[0]
+    q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
+    result = compensate(case.real, targets(None, q), case.nominal)
+    moved = np.degrees(np.abs(result.found.q - q).max())
+    assert moved > 1
+    assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
 
 
 @pytest.mark.parametrize("nominal", sampled([False, True]))
@@ -188,16 +183,7 @@ def test_a_joint_at_its_limit_does_not_turn_the_wrist_over(case, nominal):
     assert all(re.search(r"\(J4 at -150\.\d+°, limit -150°\)", note) for note in told)
 
 
-def test_a_long_way_near_a_singularity_is_told(case):
-    """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
-    q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])
-    result = compensate(case.real, targets(None, q), case.nominal)
-    moved = np.degrees(np.abs(result.found.q - q).max())
-    assert moved > 1
-    assert result.notes() == [f"line 2: a joint moves by {moved:.1f}°: near a singular pose"]
-
-
-def test_bad_targets_are_named(case):
+def test_bad_targets_are_named_and_each_row_is_compensated_for_its_payload(case):
     refuses("E-TARGETS-NO-POSES … x_mm", case.read, ["a", "b"], [["1", "2"]])
     refuses("E-TARGETS-NO-ORIENTATION", case.read, POSE[:3], [["1", "2", "3"]])
     refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, targets(None, case.q))
@@ -206,9 +192,6 @@ def test_bad_targets_are_named(case):
     for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):
         path = case.write([*POSE, "payload_kg"], [[*case.pose_rows()[0], cell]])
         refuses(message, read_targets, path, case.real, payload_kg=option)
-
-
-def test_each_row_is_compensated_for_its_payload(case):
     bent = elastic(case.real, np.random.default_rng(4))
     mass, poses = np.tile([0.0, 80.0], 2), case.poses[:4]
     at = zip(case.pose_rows()[:4], case.joint_rows()[:4], mass, strict=True)
@@ -222,15 +205,12 @@ def test_each_row_is_compensated_for_its_payload(case):
     assert [row["payload_kg"] for row in table[:2]] == ["0", "80"]
 
 
-def test_files_that_are_exchanged_or_the_same_are_told(case):
+def test_files_or_axes_that_are_exchanged_the_same_file_and_radians_without_poses_are_told(case):
     given = targets(None, case.q[:1])
     good = compensate(case.real, given, case.nominal).notes()
     assert not any("as drawn" in note or "are the same" in note for note in good)
     assert "as if they were exchanged" in compensate(case.nominal, given, case.real).notes()[0]
     assert "are the same, so that nothing is compensated" in compensate(case.real, given, case.real).notes()[0]
-
-
-def test_axes_that_are_exchanged_and_radians_without_poses_are_told(case):
     q, exchanged = case.q[:FEW], Poses(case.poses.rotation[:FEW], case.poses.translation[:FEW][:, [1, 0, 2]])
     refuses("E-ROBOT-MISMATCH … if x, y, z were y, x, z", compensate, case.real, targets(exchanged, q), case.nominal)
     notes = compensate(case.real, targets(None, np.radians(q)), case.nominal).notes()
@@ -279,16 +259,13 @@ def test_good_targets_and_arms_as_made_pass(make, count, share):
         assert robots_apart(moved, nominal) == ""
 
 
-def test_one_orientation_fits_in_every_convention():
+def test_one_orientation_fits_in_every_convention_and_joint_values_that_lead_elsewhere_are_said():
     """The tool points down in all rows, whatever the last joint's value is said to be."""
     nominal = arm(1)
     q, poses = commanded(nominal, 8, 1)
     down = np.repeat(Rotation.from_euler("xz", [180, 40], degrees=True).as_matrix()[None], 8, axis=0)
     _, notes = on_targets(nominal, targets(Poses(down, poses.translation), q))
     assert [note.split(",")[0] for note in notes] == ["joint values of 8 of 8 rows"]
-
-
-def test_joint_values_that_lead_elsewhere_are_said():
     nominal = arm(2)
     q, poses = commanded(nominal, 6, 2)
     other = q.copy()
@@ -310,20 +287,14 @@ def test_targets_in_the_arms_foot_are_said(factor, words, count):
         assert words in notes[0]
 
 
-def test_a_nominal_robot_of_another_arm_is_refused():
+def test_a_nominal_robot_of_another_arm_is_refused_and_files_unusually_far_apart_are_said():
+    """Zeros off by 1° in all joints: 2 % of the reach."""
     nominal = arm(4)
     real = made(nominal, np.random.default_rng(4))
     q, poses = commanded(nominal, 3, 4)
     for given in (targets(poses, q), targets(poses), targets(None, q)):
         refuses("E-ROBOT-MISMATCH", compensate, real, given, arm(5))
-
-
-def test_files_unusually_far_apart_are_said():
-    """Zeros off by 1° in all joints: 2 % of the reach."""
-    nominal = arm(4)
     off = replace(nominal, rows=tuple(replace(r, theta=r.theta + np.radians(1.0)) for r in nominal.rows))
-    q, poses = commanded(nominal, 3, 4)
     notes = compensate(off, targets(poses, q), nominal).notes()
     assert "more than arms are off their drawing (1% of the reach): are both files of this robot?" in notes[0]
-    real = made(nominal, np.random.default_rng(4))
     assert not any("apart" in note for note in compensate(real, targets(poses, q), nominal).notes())

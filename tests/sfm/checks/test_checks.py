@@ -27,7 +27,7 @@ from stcal.sfm.report.check import FAILED, SUSPICIOUS, Check, count_verdicts
 from stcal.sfm.report.run_page import checks_section
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.areas import circle_conic, ellipse_of_conic
 
 pytestmark = pytest.mark.slow
 

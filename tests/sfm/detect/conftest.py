@@ -17,7 +17,7 @@ from stcal.sfm.detect.candidates import EllipseOptions
 from stcal.sfm.detect.detect_files import detect_files
 from stcal.sfm.detect.labelling import LabelledImage, label_images
 from tests.scripts import load_script
-from tests.support.photograph import Photograph, RenderedSet, read_set
+from tests.support.degrade import Photograph, RenderedSet, read_set
 
 study = load_script("envelope_study")
 KINDS = study.KINDS

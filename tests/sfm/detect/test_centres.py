@@ -22,7 +22,7 @@ from stcal.synthetic.render import RenderOptions, encode, render
 from stcal.workflows.board_views import find_board
 from tests.levels import sampled
 from tests.support import degrade
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.areas import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])
 

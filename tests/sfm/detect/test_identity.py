@@ -29,7 +29,7 @@ from stcal.sfm.detect.published import EQUAL_SIGMA_PX, PublishedPattern, detect_
 from stcal.sfm.mapping.pairs import PairOptions
 from tests.outcome import refuses
 from tests.sfm.detect.test_arrangement import centres_of
-from tests.support.circle_images import circle_conic, ellipse_of_conic
+from tests.support.areas import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
 TARGET = reference_target()

@@ -12,8 +12,7 @@ from stcal.sfm.detect.predict import common_shift
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
-from tests.support.film import filmed
-from tests.support.image_poses import pose_error
+from tests.support.image_poses import filmed, pose_error
 
 pytestmark = pytest.mark.slow
 IMAGES = 4

@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal import StcalError, reference_target
+from stcal import StcalError
 from stcal.boards.target_file import target_toml
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
 from stcal.sfm.data.group_model import GROUP_LEFT_OUT
 from stcal.sfm.detect import detect_files as files
-from stcal.sfm.detect.face_patterns import likeness_notes
 from stcal.sfm.pipeline import run
 from stcal.synthetic import RenderOptions, SceneOptions, make_scene, second_design, write_dataset
 from stcal.synthetic.scene import image_circles
@@ -378,20 +377,6 @@ def test_a_run_with_another_pitch_names_the_measured_one(stcal_sfm, small_set):
     assert code == 4
     assert "the board in board.toml is 0.833" in err
     assert "times as large as the drawing in target.toml has the faces" in err
-
-
-def test_faces_that_one_circle_tells_apart_are_noted(stcal_sfm, tmp_path):
-    one, mirrored = likeness_notes(reference_target())
-    assert "faces 1, 2, 3, 4, 5: one circle tells each from another" in one
-    # Their circles c: (94.142, 65.858) and (100, 80), after a motion that fits the other nine.
-    assert "1:c against face 2, 15.3 mm" in one
-    assert "mirror images: 2 and 4, 3 and 5" in mirrored
-    assert likeness_notes(second_design()[0]) == []
-    path = tmp_path / "target.toml"
-    path.write_text(target_toml(reference_target()))
-    code, out, _ = stcal_sfm("plan", "--target", path, "--images", 2, "--width", 1296, "--groups", "12")
-    assert code == 0
-    assert out.startswith(f"note: {one}\nnote: {mirrored}\n")
 
 
 def test_images_without_folders_are_said_to_be_one_group_and_lost_boards_are_counted(stcal_sfm, small_set):
