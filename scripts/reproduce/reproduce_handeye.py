@@ -41,7 +41,8 @@ def trial(seed: int) -> dict:
     truth = simulated_views(np.random.default_rng(seed), POSES, robot=ROBOT, corner_px=CORNER_PX)
     motions = Motions.consecutive(Loop.of(truth.pairs, truth.setup))
     kept = truth.pairs[: FITTED + 1], truth.views[: FITTED + 1]
-    fitted = motions[:FITTED].with_log("de")
+    fitted = motions[:FITTED]
+    fitted = fitted[fitted.has_log()]
     found = {"ratios": ratios(truth, fitted, seed), "units": by_unit(truth, fitted)}
     for method in METHODS:
         try:

@@ -69,11 +69,11 @@ class PoseFiles:
         from stcal.workflows.handeye_inputs import Files
 
         said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
-        source = self.source or self.first
-        if source is None or (self.first is None) != (self.second is None) or (self.source and self.first):
-            raise InputError("E-OPTION-FILES", "POSES|IMAGES: one file or folder, or --a and --b, needed")
+        source, second = self.first, self.second
+        if self.source is not None or source is None or second is None:
+            source, second = shared.JoinOptions(source, second, self.key).table(self.source, "POSES|IMAGES"), None
         own = self.poses, self.camera, self.board
-        return Files(source, *own, self.second, self.key, said, self.quaternions, **timing)
+        return Files(source, *own, second, self.key, said, self.quaternions, **timing)
 
 
 POSE_FILES = PoseFiles()
@@ -205,6 +205,7 @@ def handeye(
         return
     with StageProgress() as progress:
         inputs = given.read(files.workers, progress)
+        print_each("note", inputs.notes)
         for line in inputs.understood:
             say(line)
         prior = inputs.prior if refine_camera else None
@@ -285,6 +286,7 @@ def plan(
     robot = load_robot(robot_file) if robot_file else None
     with StageProgress() as progress:
         inputs = files.given().read(files.workers, progress)
+    print_each("note", inputs.notes)
     for line in inputs.understood:
         say(line)
     planned = plan_handeye(inputs, count, robot, seed)

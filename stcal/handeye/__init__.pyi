@@ -1,9 +1,9 @@
 from .data.corner_views import View as View
 from .data.corner_views import Views as Views
 from .data.corner_views import pairs_of_views as pairs_of_views
-from .data.pose_files import read_poses as read_poses
 from .data.pose_pairs import SETUPS as SETUPS
 from .data.pose_pairs import HandEyePoses as HandEyePoses
+from .data.pose_pairs import read_poses as read_poses
 from .handeye_pipeline import handeye as handeye
 from .handeye_problem import METHODS as METHODS
 from .handeye_problem import HandEye as HandEye

@@ -99,6 +99,9 @@ def estimate_offset(
     offset, state = _scanned(pairs, stream, seconds, setup, with_scale), None
     for _ in range(ROUNDS):
         within = _inside(stream, seconds + offset)
+        if within.sum() < LEAST_POSES:
+            said = f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more"
+            raise InputError("E-TIME-OFFSET-RANGE", said)
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
         state = state or closed_form.robust(loop, with_scale)

@@ -29,6 +29,16 @@ ALIASES: dict[str, tuple[str, str]] = {
 }
 """Conventions by name of the robot: form and unit of the angles, empty if it is open. The form is an order of axes as
 in SciPy (lower case: fixed axes, upper case: rotated axes), a rotation vector or a quaternion."""
+LIKELY = {
+    "abc": "kuka-abc or mitsubishi-abc",
+    "wpr": "fanuc-wpr",
+    "oat": "kawasaki-oat",
+    "theta_x, theta_y, theta_z": "kinova",
+    "roll, pitch, yaw": "rpy",
+    "rx, ry, rz": "ur-rotvec, yaskawa, staubli, xyz, XYZ or ZYX",
+    "quaternions": "wxyz or xyzw",
+}
+"""Suggestions for ``--rotation`` by the names of the columns."""
 MOST_RAD = 2 * np.pi * 1.01
 """Largest angle up to which numbers without a unit may be radians: a turn."""
 _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
@@ -73,8 +83,8 @@ def convention_of(name: str) -> Convention:
 def said_convention(rotation: str | None, what: str, where: str, count: int = 3) -> Convention:
     """Return the convention of the option ``--rotation``; ``what`` : names of the columns, or their description."""
     if rotation is None:
-        form, likely = "Euler angles in any order of axes or rotation vectors", "kuka-abc, ur-rotvec, xyz or ZYX"
-        form, likely = ("quaternions", "wxyz or xyzw") if count == len("wxyz") else (form, likely)
+        likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
+        form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
         raise InputError("E-ROTATION-AMBIGUOUS", f"{where}: {what} may be {form}; give --rotation, like {likely}")
     convention = convention_of(rotation)
     if convention.count != count:

@@ -12,6 +12,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.conventions import flipped, tilted
+from stcal.handeye.data.pose_pairs import rms_of
 from stcal.handeye.data.stream import LONGEST_S, Timed
 from stcal.handeye.handeye_pipeline import ALL, Outcome, validated
 from stcal.handeye.handeye_problem import HandEye, HandEyeProblem, problem_of
@@ -110,6 +111,9 @@ HINT_T, SURE_SIGMAS = 3.0, 4.0
 FALLS = 0.98
 """Largest ratio of mean squares of residuals with and without a harmless offset at which the offset is reported."""
 HARMFUL = 1.0  # change of the transform by the offset, in its σ, from which it is called wrong; without σ it is always
+SMOOTH, LEAST_ROWS = 0.2, 20
+"""Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
+their order counts as that of a motion; and least number of such poses."""
 
 
 @one_thread()
@@ -168,11 +172,17 @@ def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> 
 
 
 def _is_moving(timed: Timed) -> bool:
-    """True if the robot's poses tell velocities at the images."""
+    """True if the robot's poses tell velocities at the images; about one sample for each image must be smooth."""
     samples = timed.stream.seconds
     after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
-    close = np.median(samples[after] - samples[after - 1]) <= LONGEST_S
-    return bool(close and timed.stream.spacing_s() < np.median(np.diff(np.sort(timed.seconds))) / 2)
+    if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
+        return False
+    if timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
+        return True
+    poses = timed.stream.base_from_flange
+    steps = rms_of(poses[1:].difference(poses[:-1]))
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
+    return smooth and len(timed.seconds) >= LEAST_ROWS
 
 
 def _lag_t(problem: HandEyeProblem, timed: Timed, result: HandEye) -> float:

@@ -157,8 +157,8 @@ def test_images_of_dots_whose_size_is_wrong(command, tmp_path):
     assert "stated 25 mm" in shown
     assert data["corner_px_is_factor"]
     assert {each["name"]: each["reason"] for each in data["left_out"]} == {
-        "extra.png": "in images alone",
-        "gone.png": "in poses.csv alone",
+        "extra.png": "no row in poses.csv",
+        "gone.png": "no such image, in a row of poses.csv",
     }
     assert in_sigmas(data, "flange_from_camera", FLANGE_FROM_CAMERA) < CHANCE
 
@@ -177,8 +177,8 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
         assert_error(command(*words), INPUT, said)
     header, *cells = (line.split(",", 1) for line in chessboard.poses.read_text().splitlines())
     for rows, code, parts in (
-        (["a.png", "b.png"], INPUT, ["no name or time in common"]),
-        (["0.png", "1.png"], COMPUTATION, ["2 poses, 3 needed", "left out before, first 2.png: in images alone"]),
+        (["a.png", "b.png"], INPUT, ["no row is of an image in"]),
+        (["0.png", "1.png"], COMPUTATION, ["2 poses, 3 needed", "left out before, first 2.png: no row in poses.csv"]),
     ):
         lines = [header, *([name, own] for name, (_, own) in zip(rows, cells, strict=False))]
         poses.write_text("".join(f"{name},{own}\n" for name, own in lines))

@@ -95,7 +95,7 @@ def test_two_files_of_poses_plans_and_flips_are_those_of_the_command(written, po
     given = workflows.read_handeye(robot, second=camera, setup="eye-in-hand")
     found = workflows.calibrate_handeye(given, "pose", repeats=0)
     assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
-    assert given.left_out == (("p99", "in camera.csv alone"),)
+    assert given.notes == (f"1 rows of {camera} have no partner: image p99",)
     answer = written("plan", poses, "--count", 1)
     found = workflows.plan_handeye(workflows.read_handeye(poses), 1)
     assert json.loads(json_text(HandEyePlanFile.of(found.result, found.poses, found.joints))) == answer

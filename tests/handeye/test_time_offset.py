@@ -13,10 +13,9 @@ from scipy.stats import chi2
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pose_content import PoseSide
 from stcal.handeye.data.pose_pairs import SETUPS
-from stcal.handeye.data.pose_partners import paired
 from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
 from stcal.handeye.time_offset import estimate_offset
-from stcal.workflows.handeye_inputs import times_of_images
+from stcal.workflows.handeye_inputs import Files, robot_at_images
 from tests.handeye.photographed import BOARD
 from tests.handeye.test_cli import in_sigmas
 from tests.handeye.written import table, trajectory, two
@@ -67,10 +66,9 @@ def test_what_does_not_do_and_noise_of_samples_are_told_and_there_may_be_more_im
     places = tuple(f"line {k + 2}" for k in range(5))
     robot = PoseSide(samples, places, "", names=tuple(f"{t:.1f}" for t in times), where="robot.csv", timed=True)
     seconds = np.round(0.01 + 0.04 * np.arange(9), 2)
-    images = [f"{t:.2f}.png" for t in seconds]
-    found = paired(robot, images, "images", times_of_images(images, None))
-    assert (found.rows, found.robot.names[-1], found.left_out) == (list(range(9)), "0.33.png", ())
-    assert np.abs(found.robot.poses.difference(swing(seconds, PHASE))).max() < 0.01
+    at, left_out, _ = robot_at_images(robot, [f"{t:.2f}.png" for t in seconds], Files("images"))
+    assert (len(at), at.names[-1], left_out) == (9, "0.33.png", ())
+    assert np.abs(at.poses.difference(swing(seconds, PHASE))).max() < 0.01
 
 
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
@@ -117,7 +115,7 @@ def test_dry_run_says_what_was_understood_of_times_of_names_and_of_a_file(comman
     assert code == 0, error
     assert "poses by time: 4 times in 40 samples of robot.csv: 1 at a sample, 2 interpolated" in shown
     assert "images: 3 of 4 with a pose of the robot" in shown
-    assert "left out 200.5.png: outside of robot.csv, 99.72 s from the nearest sample" in shown
+    assert "left out 200.5.png: 99.72 s after the samples of robot.csv" in shown
     code, shown, error = command(*given, "--dry-run", "--time-tolerance", 100)
     assert code == 0, error
     assert "images: 4 of 4 with a pose of the robot" in shown
@@ -127,12 +125,13 @@ def test_dry_run_says_what_was_understood_of_times_of_names_and_of_a_file(comman
     code, shown, error = command(*given, "--dry-run", "--image-times", times)
     assert code == 0, error
     assert "1 at a sample, 1 interpolated" in shown
-    assert "left out c.png: no time" in shown
-    assert_error(command(*given, "--dry-run"), INPUT, "no times of its poses or images, like a.png", "--image-times")
+    assert "left out c.png: no time in" in shown
+    said = "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)"
+    assert_error(command(*given, "--dry-run"), INPUT, said)
     for row, said in (
         ("a,soon", "time_s of a.png is 'soon', a number of"),
-        ("z,1.5", "no row is of an image, or an image has two: z"),
-        ("a,9.5", "none has a pose of the robot: first a.png"),
+        ("z,1.5", "no row is of an image: z"),
+        ("a,9.5", "no image has a pose: a.png"),
     ):
         times.write_text(f"image,time_s\n{row}\n")
         assert_error(command(*given, "--dry-run", "--image-times", times), INPUT, said)
@@ -172,9 +171,10 @@ def test_what_is_taken_is_said():
         assert part in taken.said
     assert "3 left out" in taken.said
     assert why["d"] == (
-        "in a gap of 1.05 s of robot.csv, 0.45 s from the nearest sample, 0.02 s allowed (--time-tolerance)"
+        "in a gap of 1.05 s of robot.csv, 0.25 s allowed; the nearest sample is 0.45 s away, 0.02 s allowed "
+        "(--time-tolerance)"
     )
-    assert why["f"] == "outside of robot.csv, 0.03 s from the nearest sample, 0.02 s allowed (--time-tolerance)"
+    assert why["f"] == "0.03 s after the samples of robot.csv, 0.02 s allowed (--time-tolerance)"
     assert taken_at(stream(times), np.array([5.4]), "d", 0.5).rows == [0]
     nearest = taken.base_from_flange[3]
     assert np.abs(Poses.of([nearest]).difference(swing(np.zeros(1), PHASE))).max() < 1e-12

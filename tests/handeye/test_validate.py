@@ -27,14 +27,13 @@ from stcal.handeye import (
 )
 from stcal.handeye import handeye as answer
 from stcal.handeye.choose import BY_VIEWS, CLOSED_FORMS, Tried, Way, choose, widened
-from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import read_two
-from stcal.handeye.data.pose_pairs import SETUPS, Loop, Motions
+from stcal.handeye.data.pose_pairs import SETUPS, Loop, Motions, read_poses
 from stcal.handeye.handeye_problem import HandEyeProblem
 from stcal.handeye.validate import ERRORS, errors_of, with_common_errors, with_jackknife
 from stcal.io.cameras.camera_model import camera_prior
+from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, common_columns
-from stcal.workflows.handeye_inputs import HandEyeInput
+from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
 from stcal.workflows.handeye_run import calibrate_handeye
 from tests.handeye.written import table
 from tests.levels import sampled
@@ -370,12 +369,12 @@ def test_they_are_read_from_what_measure_writes(tmp_path):
     common = np.swapaxes(pairs.camera_from_board_common, 1, 2).reshape(len(board), -1)
     errors |= dict(zip(common_columns(3), common.T.tolist(), strict=True))
     robot = table(tmp_path / "robot.csv", {"": flange}, image=images)
-    poses = table(tmp_path / "poses.csv", {"": board}, image=images, **errors)
-    as_read = read_two(robot, poses, Said(), "image").pairs
+    joined = join_tables(robot, table(tmp_path / "poses.csv", {"": board}, image=images, **errors), "image", PREFIXES)
+    as_read = read_poses(joined.table)
     assert np.allclose(as_read[[3, 5]].camera_from_board_common, pairs.camera_from_board_common[[3, 5]], rtol=1e-9)
-    named = {f"board_from_camera_{name}": values for name, values in errors.items()}
-    turned = table(tmp_path / "inverse.csv", {"board_from_camera": board}, image=images, **named)
-    inverse = read_two(robot, turned, Said(), "image").pairs
+    other = ("camera_from_board", "board_from_camera")
+    columns = {name.replace(*other): own for name, own in joined.table.columns.items()}
+    inverse = read_poses(replace(joined.table, columns=columns))
     step = 1e-4 * pairs.camera_from_board_common[:, :, 1]
     moved = board.moved(step).inverse().difference(board.inverse())
     assert np.allclose(1e-4 * inverse.camera_from_board_common[:, :, 1], moved, rtol=1e-3, atol=1e-9)

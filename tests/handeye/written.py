@@ -9,17 +9,10 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses
-from stcal.handeye.data.pose_content import PoseSide, Said
-from stcal.handeye.data.pose_files import read_side
 from stcal.io.table import POSE, pose_cells
 from tests.shared import written
-
-
-def read_robot(path: Path, said: Said, quaternions: Order = "wxyz") -> PoseSide:
-    return read_side(path, "robot", said, quaternions=quaternions)[0]
-
 
 Arguments = list[str]
 """Of ``stcal handeye``."""

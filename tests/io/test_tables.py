@@ -224,7 +224,7 @@ def test_columns_that_name_their_angles_are_not_overruled_and_half_turns_are_the
     ("header", "words"),
     [
         ("rx_deg,ry_deg,rz_deg", "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot"),
-        ("rx,ry,rz", "E-ROTATION-AMBIGUOUS … --rotation … ur-rotvec"),
+        ("rx,ry,rz", "E-ROTATION-AMBIGUOUS … --rotation … ur-rotvec, yaskawa"),
         ("w_rad,p_rad,r_rad", "E-ROTATION-AMBIGUOUS … wpr"),
         ("a,b,c", "E-ROTATION-AMBIGUOUS … abc"),
         ("roll,pitch,yaw", "E-ROTATION-AMBIGUOUS … roll, pitch, yaw"),

@@ -4,7 +4,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
@@ -15,9 +14,9 @@ from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.handeye.data.pose_pairs import HandEyePoses
 
 LEAST_CORNERS = 4
-SAME_DIGITS, APART = 6, 0.02
-"""Decimals to which normals of one plane agree, and the step of heights that are one plane's, as a share of the view's
-extent. Only the start of the pose depends on them."""
+SAME_COSINE, APART = 1 - 1e-9, 0.02
+"""Limits for corners of one plane: their normals agree to this cosine, and no gap in height exceeds this share of the
+view's extent. Only the start of the pose depends on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -168,14 +167,22 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
     """Returns the rows of the corners of each plane with enough of them, and board_from_plane, Z the normal."""
-    normals = view.normals()
-    height = (view.xyz_board * normals).sum(1)
-    step = APART * np.linalg.norm(np.ptp(view.xyz_board, axis=0))
-    key = np.column_stack([normals.round(SAME_DIGITS), np.round((height - height.min()) / max(step, 1e-12))])
-    _, plane, counts = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    planes = []
-    for number in np.flatnonzero(counts >= LEAST_CORNERS):
-        rows = np.flatnonzero(plane.ravel() == number)
-        turn = Rotation.align_vectors(normals[rows[:1]], [[0, 0, 1]])[0].as_matrix()
-        planes.append((rows, Rigid(turn, turn @ [0, 0, height[rows].mean()])))
+    normals, planes = view.normals(), []
+    extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
+    open_rows = np.ones(len(view), bool)
+    while open_rows.any():
+        normal = normals[open_rows][0]
+        alike = np.flatnonzero(open_rows & (normals @ normal > SAME_COSINE))
+        open_rows[alike] = False
+        height = view.xyz_board[alike] @ normal
+        order = np.argsort(height, kind="stable")
+        steps = np.flatnonzero(np.diff(height[order]) > APART * extent) + 1
+        turn = np.eye(3)
+        if normal[2] <= SAME_COSINE:
+            x = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
+            x /= np.linalg.norm(x)
+            turn = np.column_stack([x, np.cross(normal, x), normal])
+        for group in np.split(order, steps):
+            if len(group) >= LEAST_CORNERS:
+                planes.append((np.sort(alike[group]), Rigid(turn, turn @ [0, 0, height[group].mean()])))
     return planes

@@ -3,6 +3,7 @@ the pairs that both sides give."""
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from stcal.io.rotations import of_quaternions, proper, require_finite
 from stcal.io.table import LENGTHS
 
 EVERY_FRAME = tuple(name for names in SIDES.values() for name in names)
+BY_DEFAULT = "by default"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +46,8 @@ class PoseSide:
     each pose, if any; ``trajectory`` : whether poses are those of a moving body in a world; ``covariance`` : (m, 6, 6),
     mm and rad; ``common`` : (m, 6, k) errors that the poses have in common, contained in their covariances; ``where``,
     ``understood`` : the file, and how it was read; ``guessed`` : the unit that was guessed from the size of lengths;
-    ``own`` : whether it is a table of the package, whose columns state unit, rotation and direction; ``timed`` :
-    whether ``names`` are times by the name of their column.
+    ``own`` : whether the file is a table of the package; ``timed`` : whether ``names`` are times by the name of their
+    column.
     """
 
     poses: Poses
@@ -82,9 +84,9 @@ class HandEyeInput:
     """Input of a hand-eye calibration.
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
-    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : lines on how files
-    were read; ``setup`` : where the user or a file states it; ``timed`` : times of the pairs in the robot's stream,
-    where its poses were taken by time; ``own`` : whether tables of the package were read, whose rows have equal names.
+    ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``timed`` : times of the
+    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -97,7 +99,7 @@ class HandEyeInput:
     understood: tuple[str, ...] = ()
     setup: Setup | None = None
     timed: Timed | None = None
-    own: bool = False
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -106,11 +108,8 @@ class HandEyeInput:
         """Returns the rows of both sides, which belong together; ``lines`` : further ones on how they were read."""
         covariances = robot.covariance, camera.covariance
         pairs = HandEyePoses(robot.poses, camera.poses, *covariances, tuple(names), where, camera.common)
-        understood, own = (
-            (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines),
-            robot.own and camera.own,
-        )
-        return cls(where, pairs, understood=understood, own=own and not lines, **more)
+        understood = (f"robot: {robot.understood}", f"camera: {camera.understood}", *lines)
+        return cls(where, pairs, understood=understood, **more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,18 +212,19 @@ _WORDS = {
 """Words that name each frame."""
 _LEFT, _RIGHT = ("|".join(f"(?P<{side}_{frame}>{words})" for frame, words in _WORDS.items()) for side in "ab")
 _FORMS = (
-    (re.compile(rf"(?:{_LEFT})_from_(?:{_RIGHT})"), "ab"),
-    (re.compile(rf"(?:{_LEFT})(?:2|_wrt_|_in_)(?:{_RIGHT})"), "ba"),
+    (re.compile(rf"(?:{_LEFT})_from_(?:{_RIGHT})"), "ab", True),
+    (re.compile(rf"(?:{_LEFT})2(?:{_RIGHT})"), "ba", True),
+    (re.compile(rf"(?:{_LEFT})_(?:wrt|in)_(?:{_RIGHT})"), "ba", True),
+    (re.compile(rf"(?:{_LEFT})_?t_?(?:{_RIGHT})"), "ab", False),
+    (re.compile(rf"t_(?:{_LEFT})_(?:{_RIGHT})"), "ab", False),
 )
-"""Forms of names of transforms, and which frame is the first of ``a_from_b``."""
+"""Forms of names of transforms; which frame is the first of ``a_from_b``; whether no other reading is possible."""
 _PART = re.compile(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
 """Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
-_ENDING = r"(_?(pose|transform|matri(x|ce)|sample)s?)*"
+_ENDING = r"(_?(pose|transform|matri(x|ce))s?)?"
 ROLES_BY_NAME: dict[Role, re.Pattern] = {
-    "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp|hand_world)" + _ENDING),
-    "camera": re.compile(
-        r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern|camera_marker)" + _ENDING
-    ),
+    "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)" + _ENDING),
+    "camera": re.compile(r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern)" + _ENDING),
 }
 """Names that tell whether poses are the robot's or the camera's, but not in which direction."""
 
@@ -234,14 +234,14 @@ def frames_of(key: object) -> KnownName | None:
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
         return KnownName(name, f"by its name {key}")
-    for form, order in _FORMS:
+    for form, order, only in _FORMS:
         if match := form.fullmatch(_PART.sub("", name, count=1)):
             sides = {part[0]: part[2:] for part, text in match.groupdict().items() if text is not None}
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
-                return KnownName(frames, f"by its name {key}")
+                return KnownName(frames, f"by its name {key}", only)
     role = next((role for role, names in ROLES_BY_NAME.items() if names.fullmatch(name)), None)
-    return KnownName(SIDES[role][0], "by default", False) if role else None
+    return KnownName(SIDES[role][0], BY_DEFAULT, False) if role else None
 
 
 def inverse_name(key: str) -> str:
@@ -251,155 +251,38 @@ def inverse_name(key: str) -> str:
     return match.expand(r"\1\4\3\2") if match else ""
 
 
-NAME_KEYS = ("image", "image_name", "filename", "file", "name", "timestamp", "stamp", "time", "id", "index")
-"""Keys, also in the plural, of what names each pose."""
-HOLDERS = ("samples", "poses", "data", "transforms")
-"""Keys that may hold the poses."""
+WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
+"""Keys that may hold a pose in an object that also has its name."""
+NAME_KEYS = (
+    *("image", "img", "image_name", "image_file", "image_path", "filename", "file", "name"),
+    *("timestamp", "stamp", "time", "id", "index"),
+)
+HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measurements", "captures", "robot_poses")
+"""Keys that may hold the list of poses."""
+LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timestamps", "stamps")
+"""Keys of lists that name the poses of a stack in the same object."""
+MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
 SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
 """Setups by easy_handeye's names of them."""
-
-
-def read_tree(tree: Any, form: str, setup: Setup | None, where: str) -> PoseContent | None:
-    """Returns the poses in plain values; None where there are none. ``setup`` : as the user states it."""
-    if (content := _of_columns(*_columns(tree), form, setup, where)) is not None or not isinstance(tree, Mapping):
-        return content
-    own, parameters = None, tree.get("parameters")
-    if isinstance(parameters, Mapping):  # of easy_handeye
-        own = SETUPS.get(str(parameters.get("calibration_type", "")))
-        if isinstance(in_hand := parameters.get("eye_on_hand"), bool):
-            own = "eye-in-hand" if in_hand else "eye-to-hand"
-    for key in HOLDERS:
-        if (content := read_tree(tree.get(key), form, own or setup, where)) is not None:
-            others = (str(other) for other in tree if other not in (key, "parameters"))
-            return replace(content, setup=own, passed_over=(*content.passed_over, *others))
-    return None
-
-
-def _columns(tree: Any) -> tuple[dict[str, list], tuple[str, ...]]:
-    """Returns values, one for each pose, by key, and the poses' names, if any: of a list of objects, of an object of
-    lists, of poses by name, or of poses alone, whose key is empty."""
-    if isinstance(tree, Mapping):
-        lists = {str(k): list(v) for k, v in map(_listed, tree.items()) if isinstance(v, list | np.ndarray) and len(v)}
-        poses = list(tree.values())
-        if tree and not any(map(frames_of, tree)) and all(_row(pose) is not None for pose in poses):
-            return {"": poses}, tuple(map(str, tree))
-        columns = lists
-    elif not isinstance(tree, list | np.ndarray) or not len(tree):
-        return {}, ()
-    elif _row(tree) is not None:
-        return {"": [tree]}, ()
-    elif isinstance(tree[0], Mapping) and _row(tree[0]) is None:
-        records = [each if isinstance(each, Mapping) else {} for each in tree]
-        columns = {str(key): [each.get(key) for each in records] for key in tree[0]}
-    else:
-        return {"": list(tree)}, ()
-    naming = {key.lower(): key for key in map(str, columns)}
-    for key in (naming[name] for one in NAME_KEYS for name in (one, f"{one}s") if name in naming):
-        if all(isinstance(value, str | int | float) for value in columns[key]):
-            return {other: columns[other] for other in columns if other != key}, tuple(map(str, columns[key]))
-    return columns, ()
-
-
-def _listed(item: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Returns a key with its values, which ROS 1 has one level deeper."""
-    key, value = item
-    return key, value.get("transforms", value) if isinstance(value, Mapping) else value
-
-
-def _of_columns(
-    columns: dict[str, list], names: tuple[str, ...], form: str, setup: Setup | None, where: str
-) -> PoseContent | None:
-    """Returns the sides that keys name, or the poses of the only key that has some."""
-    parts: dict[str, dict[str, list]] = {}
-    known: dict[str, KnownName | None] = {}
-    for key, values in columns.items():
-        frames = frames_of(key)
-        if frames is not None and (frames.stated or _row(values[0]) is not None):
-            parts.setdefault(frames.name, {})[key] = values
-            known[frames.name] = frames
-    if not parts:
-        posed = {key: values for key, values in columns.items() if _row(values[0]) is not None}
-        if len(posed) != 1:
-            return None
-        parts, known = {"": posed}, {"": None}
-    keys = [key for item in parts.values() for key in item]
-    roles = [frames.role for frames in known.values() if frames is not None]
-    counts = {len(values) for item in parts.values() for values in item.values()}
-    if len(set(roles)) < len(roles) or any(len(item) > 2 for item in parts.values()):
-        said = f"{where}: {', '.join(keys)}: more than one set of the same poses; leave one of each"
-        raise InputError("E-POSES-MIXED", said)
-    if len(counts) > 1 or (names and len(names) not in counts):
-        numbers = " and ".join(map(str, sorted({*counts, *([len(names)] if names else [])})))
-        raise InputError("E-POSES-COUNT", f"{where}: {numbers} values of {', '.join(keys)}; one for each pose needed")
-    places = tuple(f"pose {i}" for i in range(1, counts.pop() + 1))
-    require_each_once(names, places[: len(names)], where)
-    sides = tuple(_side(item, names or places, names, known[name], setup, where) for name, item in parts.items())
-    if {"effector_wrt_world", "object_wrt_sensor"} == set(keys):
-        form, sides = "MoveIt hand-eye samples", tuple(replace(side, unit=ROS) for side in sides)
-    elif all(side.unit is ROS for side in sides):
-        form = "easy_handeye samples"
-    elif any("2" in key for key in keys):
-        form = "OpenCV's hand-eye arrays"
-    return PoseContent(form, sides, None, tuple(key for key in columns if key not in keys))
-
-
 ROS = KnownName("m", "as in ROS", False)
 
 
-def _side(
-    parts: dict[str, list],
-    places: tuple[str, ...],
-    names: tuple[str, ...],
-    frames: KnownName | None,
-    setup: Setup | None,
-    where: str,
-) -> PoseSide:
-    """Returns the poses under a key, or of matrices 3×3 and translations under two, as OpenCV takes them."""
-    if len(parts) == 2:
-        flat = {key: [numbers(value) for value in values] for key, values in parts.items()}
-        sizes = {key: {0 if each is None else each.size for each in arrays} for key, arrays in flat.items()}
-        of_turn, of_place = (next((k for k in flat if sizes[k] == {size}), "") for size in (9, 3))
-        if not of_turn or not of_place:
-            said = f"{where}: {', '.join(parts)}: a matrix 3×3 and a translation of 3 numbers for each pose needed"
-            raise InputError("E-POSES-SHAPE", said)
-        turn, at = (np.array([each.ravel() for each in flat[key] if each is not None]) for key in (of_turn, of_place))
-        require_finite(at, places, where)
-        poses = Poses(proper(turn.reshape(-1, 3, 3), places, where), at)
-        return PoseSide(poses, places, "3×3 matrices", frames=frames, names=names)
-    [(key, values)] = parts.items()
-    rows = [_row(value) for value in values]
-    sizes = [0 if row is None else row.size for row in rows]
-    bad = next((i for i, size in enumerate(sizes) if size != sizes[0] or not size), None)
-    if bad is not None:
-        said = f"{where}: {' '.join(filter(None, (places[bad], key)))}: no 4×4 matrix, or one of another form than the "
-        raise InputError("E-POSE-VALUE", f"{said}first; correct it, or take the pose out")
-    array = np.array(rows)
-    if array.ndim == 3:
-        return PoseSide(of_matrices(array, places, where), places, "4×4 matrices", frames=frames, names=names)
-    if frames is not None and not frames.stated:
-        fixed = setup == "eye-to-hand"
-        by = "as easy_handeye writes it" + f" of {'eye-to-hand' if fixed else 'eye-in-hand'}" * (frames.role == "robot")
-        frames = KnownName(SIDES[frames.role][fixed and frames.role == "robot"], by, False)
-    require_finite(array, places, where)
-    poses = Poses(of_quaternions(array[:, 3:], places, where), array[:, :3])
-    return PoseSide(poses, places, "quaternions x, y, z, w by name", ROS, frames, names)
-
-
-def _row(value: Any) -> np.ndarray | None:
-    """Returns a matrix (4, 4), or x, y, z, qw, qx, qy, qz (7,) of a transform of ROS; None for any other value."""
-    if isinstance(value, Mapping) and "data" not in value:
-        inner = value.get("transform", value)
-        at, turn = (inner.get(name) if isinstance(inner, Mapping) else None for name in ("translation", "rotation"))
-        if not isinstance(at, Mapping) or not isinstance(turn, Mapping):
-            return None
-        return numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
-    array = numbers(value)
-    if array is None or array.shape not in ((4, 4), (16,)):
-        return None
-    matrix = array.reshape(4, 4)
-    # Sixteen numbers are by rows, or by columns as of Franka and OpenGL: the last row is 0 0 0 1.
-    by_columns = array.ndim == 1 and not matrix[:3, 3].any() and matrix[3, :3].any()
-    return matrix.T if by_columns else matrix
+def read_tree(value: Any, form: str, statements: Said, where: str) -> PoseContent | None:
+    """Returns the poses in plain values; None where there are none."""
+    content = None
+    if isinstance(value, Mapping):
+        content = _easy_handeye(value, statements, where) or _of_keys(value, form, where)
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        content = _of_pairs(value, form, where)
+    if content is None and (side := _side_of(value, where)) is not None:
+        return PoseContent(form, (side,))
+    if content is not None or not isinstance(value, Mapping):
+        return content
+    for key in HOLDERS:
+        if (content := read_tree(value.get(key), form, statements, where)) is not None:
+            others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+            return replace(content, passed_over=(*content.passed_over, *others))
+    return None
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -422,3 +305,191 @@ def _all_numbers(value: Any) -> bool:
     if isinstance(value, list):
         return all(_all_numbers(item) for item in value)
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _matrix(value: Any) -> tuple[np.ndarray, str] | None:
+    """Returns the matrix (4, 4) in a value and its name, empty where it has none; None for any other value."""
+    array = numbers(value)
+    if array is not None and array.shape == (16,):
+        array = array.reshape(4, 4)  # by rows, or by columns as of Franka and OpenGL: the last row is 0 0 0 1
+        array = array.T if not array[:3, 3].any() and array[3, :3].any() else array
+    if array is not None:
+        return (array, "") if array.shape == (4, 4) else None
+    if not isinstance(value, Mapping):
+        return None
+    named = [each for each in value.values() if (own := numbers(each)) is not None and own.size == 16]
+    inside = [value[key] for key in WRAPPED if key in value] or (named if _name_in(value) else [])
+    found = _matrix(inside[0]) if len(inside) == 1 else None
+    return found and (found[0], found[1] or _name_in(value))
+
+
+def _name_in(value: Mapping) -> str:
+    """Returns the image, timestamp or number that belongs to a pose."""
+    given = (value.get(key) for key in NAME_KEYS)
+    return next((str(v).strip() for v in given if isinstance(v, str | int | float) and not isinstance(v, bool)), "")
+
+
+def _side_of(value: Any, where: str, frames: KnownName | None = None) -> PoseSide | None:
+    """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
+    names: tuple[str, ...] = ()
+    if isinstance(value, Mapping) and _matrix(value) is not None:
+        values, places = [value], ("the pose",)
+    elif isinstance(value, Mapping):
+        names = places = tuple(map(str, value))
+        values = list(value.values())
+        if any(_matrix(item) is None for item in values):
+            return None
+    elif isinstance(value, list | np.ndarray):
+        array = numbers(value)
+        values = [array] if array is not None and array.shape in ((4, 4), (16,)) else list(value)
+        places = tuple(f"pose {i}" for i in range(1, len(values) + 1))
+    else:
+        return None
+    found = [_matrix(item) for item in values]
+    if not found or found[0] is None:
+        return None
+    bad = [place for place, each in zip(places, found, strict=True) if each is None]
+    if bad:
+        raise InputError("E-POSE-VALUE", f"{where}: {bad[0]}: not a 4×4 matrix like the one before; take it out")
+    matrices, named = zip(*filter(None, found), strict=True)
+    names = names or (named if all(named) else ())
+    require_each_once(names, places[: len(names)], where)
+    return PoseSide(of_matrices(np.array(matrices), places, where), places, "4×4 matrices", None, frames, names)
+
+
+def _easy_handeye(value: Mapping, statements: Said, where: str) -> PoseContent | None:
+    """Returns easy_handeye's samples, in which the robot's poses are inverted for a camera that stands still."""
+    samples, parameters = value.get("samples", value), value.get("parameters")
+    if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
+        lists = [samples["hand_world_samples"], samples["camera_marker_samples"]]
+        lists = [entry.get("transforms") if isinstance(entry, Mapping) else entry for entry in lists]
+    elif isinstance(samples, list) and samples and all(isinstance(entry, Mapping) for entry in samples):
+        camera_key = next((key for key in ("tracking", "optical") if key in samples[0]), None)
+        if camera_key is None or "robot" not in samples[0]:
+            return None
+        for i, sample in enumerate(samples, 1):
+            if "robot" not in sample or camera_key not in sample:
+                needed = f"robot and {camera_key} needed; take it out"
+                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: {needed}")
+        lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
+    else:
+        return None
+    setup: Setup | None = None
+    if isinstance(parameters, Mapping):
+        setup = SETUPS.get(str(parameters.get("calibration_type", "")))
+        if isinstance(parameters.get("eye_on_hand"), bool):
+            setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
+    fixed = (setup or statements.setup) == "eye-to-hand"
+    of_setup = "eye-to-hand" if fixed else "eye-in-hand"
+    by = "as easy_handeye writes it"
+    frames = KnownName(SIDES["robot"][fixed], f"{by} of {of_setup}", False), KnownName("camera_from_board", by, False)
+    sides = [_of_messages(entry, where, side) for entry, side in zip(lists, frames, strict=True)]
+    return PoseContent("easy_handeye samples", _same_count(sides, where), setup)
+
+
+def _of_messages(values: Any, where: str, frames: KnownName) -> PoseSide:
+    """Returns the poses of a list of ROS's transforms, metres."""
+    if not isinstance(values, list) or not values:
+        raise InputError("E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; save them anew")
+    places, rows = tuple(f"sample {i}" for i in range(1, len(values) + 1)), []
+    for value, place in zip(values, places, strict=True):
+        row = None
+        with suppress(AttributeError):  # of what is no mapping
+            parts = value.get("transform", value)
+            at, turn = parts.get("translation"), parts.get("rotation")
+            row = numbers([*(at.get(c, "") for c in "xyz"), *(turn.get(c, "") for c in "wxyz")])
+        if row is None:
+            said = "no translation x, y, z and rotation x, y, z, w; correct it"
+            raise InputError("E-POSE-VALUE", f"{where}: {place}: {said}")
+        rows.append(row)
+    require_finite(np.array(rows), places, where)
+    poses = Poses(of_quaternions(np.array(rows)[:, 3:], places, where), np.array(rows)[:, :3])
+    return PoseSide(poses, places, "quaternions x, y, z, w by name", ROS, frames)
+
+
+def _of_keys(value: Mapping, form: str, where: str) -> PoseContent | None:
+    """Returns stacks of poses, each side under keys that name it."""
+    parts: dict[str, dict[str, Any]] = {}
+    named: dict[str, KnownName] = {}
+    others, names = [], ()
+    for key, item in value.items():
+        if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
+            names = tuple(str(name) for name in item)
+            continue
+        frames, shaped = frames_of(key), isinstance(item, list | Mapping | np.ndarray)
+        if frames is None or not shaped or (frames.by == BY_DEFAULT and _side_of(item, where) is None):
+            others.append(str(key))
+            continue
+        parts.setdefault(frames.name, {})[str(key)] = item
+        named[frames.name] = frames
+    if not parts:
+        return None
+    roles = [frames.role for frames in named.values()]
+    if len(set(roles)) < len(roles) or any(len(item) > 2 for item in parts.values()):
+        keys = ", ".join(key for item in parts.values() for key in item)
+        raise InputError("E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each")
+    sides = []
+    for name, item in parts.items():
+        [first, *more] = item.values()
+        side = _of_rotations(item, where, named[name]) if more else _side_of(first, where, named[name])
+        if side is None:
+            needed = "4×4 matrices, or matrices 3×3 and translations, needed"
+            raise InputError("E-POSES-NOT-FOUND", f"{where}: {', '.join(item)}: no poses; {needed}")
+        sides.append(side)
+    if names and len(names) != len(sides[0]):
+        raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
+    if names:
+        require_each_once(names, sides[0].places, where)
+        sides = [replace(side, names=names) for side in sides]
+    opencv = any("2" in key for item in parts.values() for key in item)
+    return PoseContent("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
+
+
+def _of_rotations(parts: dict[str, Any], where: str, frames: KnownName) -> PoseSide:
+    """Returns the poses of matrices 3×3 and translations under two keys, as ``cv2.calibrateHandEye`` takes them."""
+    arrays: dict[str, np.ndarray] = {}
+    for key, item in parts.items():
+        rows = [value if (of_pose := numbers(value)) is None else of_pose.ravel().tolist() for value in item]
+        if (array := numbers(rows if isinstance(item, list) else item)) is None:
+            raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
+        arrays[key] = array
+    turn_key, at_key = sorted(arrays, key=lambda key: -arrays[key].size)
+    turn, at = arrays[turn_key], arrays[at_key]
+    count = 1 if at.size == len("xyz") else len(at)
+    if at.size != 3 * count or turn.size != 9 * count:
+        shapes = f"{where}: {turn_key} of shape {turn.shape}, {at_key} of {at.shape}"
+        raise InputError("E-POSES-SHAPE", f"{shapes}; a matrix 3×3 and a translation of 3 numbers for each pose needed")
+    places = tuple(f"pose {i}" for i in range(1, count + 1))
+    at = at.reshape(count, 3)
+    require_finite(at, places, where)
+    poses = Poses(proper(turn.reshape(-1, 3, 3), places, where), at)
+    return PoseSide(poses, places, "3×3 matrices", frames=frames)
+
+
+def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> PoseContent | None:
+    """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
+    stacks: dict[str, Any] = {}
+    for key, entry in value[0].items():
+        if frames_of(key) is None or _matrix(entry) is None:
+            continue
+        if without := [i for i, other in enumerate(value, 1) if key not in other]:
+            said = f"pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out"
+            raise InputError("E-POSE-INCOMPLETE", f"{where}: {said}")
+        stacks[key] = [other[key] for other in value]
+    if not stacks:
+        return None
+    moveit, names = stacks.keys() == MOVEIT, [_name_in(entry) for entry in value]
+    naming = ("image", "name", "header", "timestamp", "stamp", "id") if all(names) else ()
+    unused = tuple(key for key in value[0] if key not in stacks and key not in naming)
+    content = _of_keys(stacks | ({"names": names} if all(names) else {}), form, where)
+    if content is None:
+        return None
+    sides = tuple(replace(side, unit=ROS) for side in content.sides) if moveit else content.sides
+    return PoseContent("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
+
+
+def _same_count(sides: list[PoseSide], where: str) -> tuple[PoseSide, ...]:
+    if len({len(side) for side in sides}) > 1:
+        counts = " and ".join(f"{len(side)} of {side.frames.name if side.frames else 'one side'}" for side in sides)
+        raise InputError("E-POSES-COUNT", f"{where}: {counts}; pairs needed")
+    return tuple(sides)

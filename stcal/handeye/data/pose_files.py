@@ -27,9 +27,9 @@ from stcal.handeye.data.pose_content import (
     read_tree,
     require_each_once,
 )
-from stcal.handeye.data.pose_pairs import SIDES, HandEyePoses, Role, Setup, inverted
-from stcal.handeye.data.pose_partners import paired, times_of
-from stcal.handeye.data.stream import TOLERANCE_S
+from stcal.handeye.data.pose_pairs import SIDES, Role, inverted, read_poses, read_side
+from stcal.handeye.data.pose_partners import matched
+from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, taken_at
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.join import keys_of
 from stcal.io.rotations import (
@@ -44,19 +44,26 @@ from stcal.io.rotations import (
 from stcal.io.table import FARTHEST, LENGTHS, Table, is_comment, read_table, separator_stated
 from stcal.io.toml import load_documents
 
-TABLE, TIME = "table", "time_s"
-NAMES = ("image", "image_name", "filename", "file", "name", "pose", TIME, "timestamp", "stamp", "time")
+TABLE = "table"
+NAMES = (
+    *("image", "image_name", "filename", "file", "name", "pose"),
+    *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time_s", "time"),
+)
 """Columns that name a row, in order of preference."""
 NUMBERS = ("nr", "no", "number", "index", "id", "#")
 """Columns that name a row where no value occurs twice: elsewhere they number something else, such as the board."""
 
 
-def read_columns(table: Table, key: str, statements: Said) -> PoseContent:
-    """Returns the poses in the columns of a table, whose column ``key`` names them; raises InputError: none are in it.
+def todays(table: Table) -> bool:
+    """True if the columns are those of the package's own tables: a place with its unit, and a quaternion."""
+    prefixes = ("", *(f"{name}_" for name in EVERY_FRAME))
+    placed = [prefix for prefix in prefixes if table.has(f"{prefix}x", LENGTHS)]
+    return bool(placed) and all(f"{prefix}qw" in table for prefix in placed)
 
-    The table is the package's own if its columns are places with their units, and quaternions.
-    """
-    (names, timed), sides = _row_names(table, key), []
+
+def read_columns(table: Table, key: str, statements: Said) -> PoseContent | None:
+    """Returns the poses in the columns of a table; None where it has none."""
+    names, sides = _row_names(table, key), []
     prefixes = {f"{frame}_": KnownName(frame, f"by the columns {frame}_…") for frame in EVERY_FRAME}
     for prefix, frames in (*prefixes.items(), ("", None)):
         if (sides and not prefix) or (place := _place(table, prefix)) is None:
@@ -65,13 +72,9 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent:
             continue
         covariance, (at, unit) = table.pose_covariances(prefix), place
         common, poses = table.common_errors(covariance, prefix), Poses(turned.rotation, at)
-        known = {"covariance": covariance, "common": common, "timed": timed}
-        known["own"] = unit is not None and f"{prefix}qw" in table
-        sides.append(PoseSide(poses, places_of(table), turned.words, unit, frames, names, **known))
+        sides.append(PoseSide(poses, places_of(table), turned.words, unit, frames, names, False, covariance, common))
     if not sides:
-        said = f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, "
-        said += f"rz, a, b, c …) needed; the header is {table.header()}; rename them, like base_from_flange_x_mm"
-        raise InputError("E-POSES-NOT-FOUND", said)
+        return None
     known = [side.frames for side in sides if side.frames is not None]
     if len({frames.role for frames in known}) < len(known):
         both = ", ".join(frames.name for frames in known)
@@ -79,31 +82,30 @@ def read_columns(table: Table, key: str, statements: Said) -> PoseContent:
     return PoseContent(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
 
-def _row_names(table: Table, key: str) -> tuple[tuple[str, ...], bool]:
-    """Returns image or time of each row, as text: nanoseconds have more digits than a float; empty without a column.
-    And whether they are times by the name of their column."""
+def _row_names(table: Table, key: str) -> tuple[str, ...]:
+    """Returns image or time of each row, as text: nanoseconds have more digits than a float; empty without a column."""
     lower = {name.lower(): name for name in table.columns}
-    if key != NAMES[0] and key not in table:
-        said = f"{table.where}: no column {key}; the header is {table.header()}; give another --key"
-        raise InputError("E-TABLE-COLUMN-MISSING", said)
     column = next((name for name in (key, *NAMES) if name in table), None)
     if column := column or next((lower[name] for name in NAMES if name in lower), None):
-        return tuple(table.text(column)), column == TIME
+        values = tuple(table.text(column))
+        require_each_once(values, places_of(table), table.where)
+        return values
     number = next((lower[name] for name in NUMBERS if name in lower), None)
     values = tuple(table.text(number)) if number is not None else ()
-    return values if len(set(values)) == len(table) else (), False
+    return values if len(set(values)) == len(table) else ()
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, KnownName | None] | None:
-    for unit in (*LENGTHS, ""):
-        names = (f"{axis}_{unit}".removesuffix("_") for axis in "xyz")
-        present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
-        if len(present) == len("xyz"):
-            values = np.column_stack([table.numbers(column) for column in present])
-            return values, KnownName(unit, "by the columns") if unit else None
-        if present and unit:
-            alone = f"{table.where}: {', '.join(present)} alone"
-            raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
+    for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
+        for unit in (*LENGTHS, ""):
+            names = (form.format(axis) + f"_{unit}" * bool(unit) for axis in "xyz")
+            present = [column for name in names if (column := find_column(table, prefix, name)) is not None]
+            if len(present) == len("xyz"):
+                values = np.column_stack([table.numbers(column) for column in present])
+                return values, KnownName(unit, "by the columns") if unit else None
+            if present and unit and form == "{}":
+                alone = f"{table.where}: {', '.join(present)} alone"
+                raise InputError("E-TABLE-COLUMN-MISSING", f"{alone}; x, y and z in one unit needed")
     return None
 
 
@@ -118,30 +120,34 @@ TUM = 8  # numbers in a line of a TUM trajectory
 NANOSECONDS = 19  # digits of a time in ns since 1970
 _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 _UNIVERSAL = re.compile(r"p\s*\[(.*)\]")
-_OF_YAML = re.compile(r"%YAML|[{\[]|-( |$)|[^,;\t]*:( |$)")
-"""First line of YAML; a header of a table has no colon before its first separator."""
+_BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
+"""A unit in the header of a table, which is no list of YAML."""
+_HEADER = re.compile(r"[^:\[{]*[,;\t]")
+_SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
+"""A header of columns between which spaces stand, of six names at least, as a pose needs."""
 
 
-def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent:
-    """Returns the content of a file. ``key`` : the column that names rows; ``quaternions`` as in
-    :func:`~stcal.io.table.read_table`."""
+def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
+    """Returns the content of a file. Returns None for the package's own tables, and for tables whose readers give
+    better messages.
+
+    ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
+    """
     if path.is_dir():
         raise InputError("E-POSES-NOT-FOUND", f"{path}: a folder; one file needed: {KNOWN}")
     try:
         data = read_bytes(path, TABLE_BYTES)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
-    content = _content(path, data, statements)
-    if content is None:
-        return read_columns(read_table(path, "pose file", quaternions), key, statements)
-    if quaternions != "wxyz":
+    content = _content(path, data, statements, key, quaternions)
+    if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
         said = f"--quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out"
         raise InputError("E-OPTION-NEEDS", f"{path}: {said}")
     return content
 
 
-def _content(path: Path, data: bytes, said: Said) -> PoseContent | None:
-    """Returns the content as of the first format that the file may be of; None of a table, or of no text."""
+def _content(path: Path, data: bytes, said: Said, key: str, quaternions: Order) -> PoseContent | None:
+    """Returns the content as of the first format that the file may be of."""
     where = str(path)
     if data.startswith(NPY):
         return _of_values(_array(data, where), "NumPy array", said, where)
@@ -167,11 +173,16 @@ def _content(path: Path, data: bytes, said: Said) -> PoseContent | None:
         convention = said_convention(said.rotation, "the numbers after x, y, z", where)
         rotation, words = rotations(values[:, 3:], convention, places, where)
         return PoseContent("rows of numbers", (PoseSide(Poses(rotation, values[:, :3]), places, words),))
-    if (numbers := _numbers(first)) and len(numbers) == TUM:
-        return _of_tum(lines, [line for line in text.splitlines() if is_comment(line)], said, where)
-    if numbers:
+    name, *others = re.split(r"[\s,;]+", first, maxsplit=1)
+    named = _numbers(others[0]) if others and ":" not in name and name != "-" else None
+    if numbers := _numbers(first) or named:
+        if len(_numbers(first) or ()) == TUM:
+            return _of_tum(lines, [line for line in text.splitlines() if is_comment(line)], said, where)
         raise _not_known(where, f"rows of {len(numbers)} numbers without a header")
-    return _of_yaml(text, said, where) if _OF_YAML.match(first) else None
+    if _HEADER.match(_BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first):
+        table = read_table(path, "pose file", quaternions)
+        return None if todays(table) else read_columns(table, key, said)
+    return _of_yaml(text, said, where)
 
 
 def _not_known(where: str, found: str) -> InputError:
@@ -219,7 +230,7 @@ def _of_tum(lines: list[tuple[int, str]], comments: list[str], said: Said, where
 
 
 def _of_values(value: Any, form: str, said: Said, where: str) -> PoseContent:
-    content = read_tree(value, form, said.setup, where)
+    content = read_tree(value, form, said, where)
     if content is None:
         held = f"keys {', '.join(map(str, list(value)[:SHOWN]))} …" if isinstance(value, dict) else form
         raise _not_known(where, f"no poses in {held}")
@@ -243,6 +254,7 @@ def _of_yaml(text: str, said: Said, where: str) -> PoseContent:
 def _of_npz(data: bytes, said: Said, where: str) -> PoseContent:
     """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
+    others = []
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
@@ -251,15 +263,19 @@ def _of_npz(data: bytes, said: Said, where: str) -> PoseContent:
                 sizes = f"{size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
                 raise InputError("E-FILE-TOO-LARGE", f"{where}: {sizes}")
             for member in members:
-                name, arrays[name] = member.filename.removesuffix(".npy"), None
-                with suppress(InputError):
-                    arrays[name] = _array(archive.read(member), where)
+                name, content = member.filename.removesuffix(".npy"), archive.read(member)
+                try:
+                    arrays[name] = _array(content, where)
+                except InputError:
+                    others.append(name)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
         raise _damaged(where, error) from error
     if not any(isinstance(array, np.ndarray) for array in arrays.values()):
         raise InputError("E-NUMPY-CONTENT", f"{where}: no arrays of numbers; save it with np.savez")
-    single = next(iter(arrays.values())) if len(arrays) == 1 else None
-    return read_tree(single, "NumPy arrays", said.setup, where) or _of_values(arrays, "NumPy arrays", said, where)
+    form, [first, *more] = "NumPy arrays", arrays.values()
+    single = None if more else read_tree(first, form, said, where)
+    content = single or _of_values(arrays, form, said, where)
+    return replace(content, passed_over=(*content.passed_over, *others))
 
 
 def _array(data: bytes, where: str) -> np.ndarray | list[str]:
@@ -290,44 +306,27 @@ MIXED = 100.0  # ratio of the farthest to the nearest pose above which poses are
 SHOWN = 4  # keys that a message names
 
 
-def read_poses(path: str | Path, quaternions: Order = "wxyz") -> HandEyePoses:
-    """Reads a file of pose pairs.
+def read_pairs(source: Path | Table, statements: Said, quaternions: Order = "wxyz") -> HandEyeInput:
+    """Returns the pose pairs of one file, or of a table of the package's own.
 
-    Parameters
-    ----------
-    path : a table with columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or
-        ``flange_from_base_…``, ``board_from_camera_…``), covariances ``…_cov_rx_rx`` … and what the errors of the
-        camera's poses have in common, ``…_common1_rx`` …; or any other file that ``stcal handeye`` reads
-    quaternions : {"wxyz", "xyzw"}, ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order
-        of the columns
-
-    Returns
-    -------
-    HandEyePoses : Poses in mm; pairs of a table are named by their lines.
-
-    Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
-    line; copied poses.
+    Raises InputError: the message says what is wrong with the file, or that it holds poses of one side only.
     """
-    return read_pairs(Path(path), Said(), quaternions).pairs
-
-
-def read_pairs(path: Path, statements: Said, quaternions: Order = "wxyz") -> HandEyeInput:
-    """Returns the pose pairs of one file. Raises InputError: the message says what is wrong with the file, or that it
-    holds poses of one side only."""
-    content = read_content(path, statements, "image", quaternions)
+    if isinstance(source, Table) or (content := read_content(source, statements, "image", quaternions)) is None:
+        pairs = read_poses(source, quaternions)  # first: a table that is not understood states nothing
+        require_unsaid(statements, str(source))
+        return HandEyeInput(pairs.where, pairs)
     if len(content.sides) == 1:
         frames = content.sides[0].frames
         held = f"{frames.name} alone" if frames is not None else "poses of one side, robot or camera"
-        said = f"{path}: {content.form} with {held}"
+        said = f"{source}: {content.form} with {held}"
         raise InputError("E-POSES-MIXED", f"{said}; give the robot's file as --a and the camera's as --b")
-    robot, camera = (settled(content, role, path, statements) for role in SIDES)
+    robot, camera = (settled(content, role, source, statements) for role in SIDES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
-        said = f"{path}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        said = (
+            f"{source}: by their size the robot's lengths are in {robot.guessed} and the camera's in {camera.guessed}"
+        )
         raise InputError("E-POSES-UNITS", f"{said}; write both in one unit, or to two files for --a and --b")
-    require_unsaid(statements, robot, camera)
-    names = robot.places if robot.own else robot.called()
-    require_each_once(names, robot.places, str(path))
-    return HandEyeInput.of(robot, camera, names, path.name, setup=content.setup)
+    return HandEyeInput.of(robot, camera, robot.names or camera.called(), source.name, setup=content.setup)
 
 
 def read_two(
@@ -338,44 +337,113 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
-) -> HandEyeInput:
-    """Returns the robot's poses and the camera's, from two files, as pairs.
+) -> HandEyeInput | None:
+    """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
+    tables.
 
     The rows are joined by image or time, or by their order where neither file has names. Where times are not equal,
     and for all rows where ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``.
     """
-    files = zip(SIDES, (first, second), keys_of(key), strict=True)
-    (robot, setup), (camera, other) = (read_side(path, role, statements, own, quaternions) for role, path, own in files)
-    require_unsaid(statements, robot, camera)
-    told, times = {"named": bool(camera.names), "at_times": timed, "tolerance_s": tolerance_s}, times_of(camera)
-    found = paired(robot, camera.called(), camera.where, times, **told)
-    where = f"{first.name} with {second.name}"
-    more = {"setup": setup or other, "left_out": found.left_out, "timed": found.timed}
-    return HandEyeInput.of(found.robot, camera[found.rows], found.robot.called(), where, found.lines, **more)
+    files = tuple(zip(SIDES, (first, second), keys_of(key), strict=True))
+    contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
+    if not any(contents):
+        return None
+    sides, setup = [], next((each.setup for each in contents if each is not None and each.setup), None)
+    for (role, path, own), content in zip(files, contents, strict=True):
+        if content is None:
+            table = read_table(path, "table", quaternions)
+            content = read_columns(table, own, statements)
+            if content is None:
+                raise _no_poses(table)
+        sides.append(settled(content, role, path, statements))
+    (robot, camera), where = sides, f"{first.name} with {second.name}"
+    times, wanted = (stamps_of(side.names) if side.names else None for side in sides)
+    if timed and (times is None or wanted is None):
+        untimed = (robot if times is None else camera).where
+        raise InputError("E-POSES-UNTIMED", f"{untimed}: no times of its poses; with --time-offset both need them")
+    if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
+        stream = Stream.of(times, robot.poses, first.name)
+        seconds = stream.after_origin(wanted)
+        taken = taken_at(stream, seconds, camera.names, tolerance_s)
+        if not taken.rows:
+            said = f"no pose has one of the robot: first {', '.join(taken.left_out[0])}"
+            raise InputError("E-POSES-UNMATCHED", f"{camera.where}: {said}")
+        lines = [taken.said]
+        if robot.covariance is not None:
+            lines.append("covariances of the robot's poses are not used: they are of other times")
+        robot, camera = replace(robot, poses=taken.base_from_flange, covariance=None), camera[taken.rows]
+        more = {"left_out": taken.left_out, "timed": Timed(stream, seconds[taken.rows])}
+        return HandEyeInput.of(robot, camera, camera.names, where, lines, setup=setup, **more)
+    rows, how = matched(robot, camera, key)
+    a, b = ([row[k] for row in rows] for k in (0, 1))
+    stamped = None
+    if times is not None and wanted is not None and len(set(times)) >= max(len(times), len(rows) + 1):
+        stream = Stream.of(times, robot.poses, first.name)
+        if stream.spacing_s() <= LONGEST_S:
+            stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
+    alone = [(robot, first, a)] if stamped is None else []  # samples between images are no mistake
+    left_out = []
+    for side, path, used in (*alone, (camera, second, b)):
+        left_out += [(name, f"in {path.name} alone") for i, name in enumerate(side.called()) if i not in used]
+    more = {"setup": setup, "left_out": tuple(left_out), "timed": stamped}
+    lines = [f"rows joined {how}"] if how else []
+    return HandEyeInput.of(robot[a], camera[b], robot[a].called(), where, lines, **more)
 
 
-def read_side(
-    path: Path, role: Role, statements: Said, key: str = "image", quaternions: Order = "wxyz"
-) -> tuple[PoseSide, Setup | None]:
-    """Returns the poses of one side, and the setup that their file states, if any.
+TIME = "time_s"  # column of a stream of poses, in place of ``image``
 
-    ``statements`` : the user's statements about what a file does not state itself; others as of :func:`read_content`.
+
+def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> PoseSide:
+    """Returns the robot's poses of a file. A table of the package's own has a column ``image``, or ``time_s``, and
+    ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``statements`` : the
+    user's statements about what a file of another program does not state itself.
     """
-    content = read_content(path, statements.of(role), key, quaternions)
-    side = settled(content, role, path, statements)
-    require_each_once(side.names, side.places[: len(side.names)], str(path))
-    if side.own and not side.names:
-        raise InputError("E-TABLE-COLUMN-MISSING", f"{path}: no column image or {TIME} to join its rows by; add one")
-    return side, content.setup
+    content = read_content(path, statements.of("robot"), "image", quaternions)
+    if content is not None:
+        return settled(content, "robot", path, statements)
+    if statements.options():
+        require_own(path, quaternions)
+        require_unsaid(statements, f"robot poses {path}")
+    table = read_table(path, "robot poses", quaternions)
+    timed = "image" not in table and TIME in table
+    names = tuple(table.text(TIME if timed else "image"))
+    require_each_once(names, places_of(table), table.where, "image ")
+    poses, covariance, _ = read_side(table, *SIDES["robot"])
+    frame = next(name for name in SIDES["robot"] if any(column.startswith(f"{name}_") for column in table.columns))
+    understood = f"{path.name}: table; {len(names)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
+    read = {"names": names, "covariance": covariance, "where": str(path), "understood": understood, "own": True}
+    return PoseSide(poses, places_of(table), "quaternions by name", timed=timed, **read)
 
 
-def require_unsaid(statements: Said, *sides: PoseSide) -> None:
-    """Refuse statements where all columns state the same."""
-    if statements.options() and all(side.own for side in sides):
-        said = f"{', '.join({side.where: '' for side in sides})}: the names of columns state unit, rotation and "
-        said += f"direction; leave {', '.join(statements.options())} out, and rename columns that are wrong "
-        said += "(base_from_flange_x_m in place of …_x_mm, or flange_from_base_x_mm)"
+def require_unsaid(statements: Said, where: str) -> None:
+    """Refuse statements on a table whose columns state the same."""
+    if statements.options():
+        said = f"{where}: the names of columns state unit, rotation and direction; leave "
+        said += f"{', '.join(statements.options())} out, and "
+        said += "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, or flange_from_base_x_mm)"
         raise InputError("E-OPTION-NEEDS", said)
+
+
+def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
+    """Returns lines that describe a table of pose pairs of the package's own."""
+    table = read_table(source, "pose file", quaternions)
+    content, place = read_columns(table, "image", Said()), Path(table.where.removeprefix("pose file "))
+    return [f"{role}: {settled(content, role, place, Said()).understood}" for role in SIDES] if content else []
+
+
+def require_own(path: Path, quaternions: Order = "wxyz") -> None:
+    """Refuse a table without poses in its columns."""
+    table = read_table(path, "table", quaternions)
+    if not todays(table):
+        raise _no_poses(table)
+
+
+def _no_poses(table: Table) -> InputError:
+    said = f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
+    said += f"a, b, c …) needed; the header is {table.header()}; rename them"
+    return InputError("E-POSES-NOT-FOUND", said)
 
 
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -10,9 +11,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, freeze, require_fields
-from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.io.table import LENGTHS
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
+from stcal.geometry.rigid import Order, Poses, Rigid, skew
+from stcal.io.table import LENGTHS, Table, read_table
 
 Role = Literal["robot", "camera"]
 SIDES: dict[Role, tuple[str, str]] = {
@@ -90,11 +91,16 @@ class HandEyePoses(Brief):
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
         sides = []
         for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
-            try:
-                poses = matrices if isinstance(matrices, Poses) else Poses.from_matrices(matrices)
-            except InputError as error:
-                raise InputError(error.code, f"{where}: {side}: {error}") from error
-            sides.append(Poses(poses.rotation, LENGTHS[unit] * poses.translation))
+            if not isinstance(matrices, Poses):
+                rigid = []
+                for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
+                    try:
+                        rigid.append(Rigid.from_matrix(matrix))
+                    except InputError as error:
+                        name = names[i] if i < len(names) else f"pose {i + 1}"
+                        raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
+                matrices = Poses.of(rigid)
+            sides.append(Poses(matrices.rotation, LENGTHS[unit] * matrices.translation))
         first, second = sides
         return cls(first, second, names=tuple(names), where=where)
 
@@ -115,13 +121,14 @@ class HandEyePoses(Brief):
         if not copies:
             return
         i, j = min((i, same[0]) for same in copies for i in same[1:])
-        pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
+        pair, others = f"{self.where}: {self.names[j]} and {self.names[i]}", sum(map(len, copies)) - len(copies) - 1
         moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
         turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
         said = f": the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "
         said += f"{np.degrees(turned):.3g}°; give each its own pose of the board"
         if moved == 0 and turned < 1e-12:
-            said = " are identical poses; keep one of each"
+            more, out = (f", and {others} more pairs", "one of each") if others else ("", "one of them")
+            said = f"{more} are identical poses; take {out} out"
         raise InputError("E-POSES-IDENTICAL", f"{pair}{said}")
 
     def require_moving_flange(self):
@@ -169,6 +176,48 @@ def rms_of(differences: np.ndarray) -> tuple[float, float]:
     """Returns the RMS lengths of differences of poses, (m, 6): rad, mm."""
     turn, shift = np.sqrt((differences.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
     return float(turn), float(shift)
+
+
+def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
+    """Read a CSV file of pose pairs.
+
+    Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
+    ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
+    The camera's side may also have ``…_common1_rx`` …, what the errors of its poses have in common.
+
+    Parameters
+    ----------
+    path : the file
+    quaternions : {"wxyz", "xyzw"}, ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order
+        of the columns
+
+    Returns
+    -------
+    HandEyePoses : Poses in mm; pairs are named by their lines.
+
+    Raises InputError: missing columns; a value that is not finite or a quaternion that is not of unit length, named by
+    line; copied poses.
+    """
+    table = read_table(path, "pose file", quaternions)
+    sides = [read_side(table, *names) for names in SIDES.values()]
+    (flange, flange_covariance, _), (board, board_covariance, common) = sides
+    names = tuple(f"line {line}" for line in table.lines)
+    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where, common)
+
+
+def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
+    """Returns poses ``wanted``, covariances and common errors, from the columns of ``wanted`` or of its inverse."""
+    names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
+    if len(names) != 1:
+        fault = "no such columns" if not names else "both"
+        needed = f"{wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}"
+        other = [name for side in SIDES.values() if wanted not in side for name in side]
+        swapped = not names and any(column.startswith(f"{name}_") for name in other for column in table.columns)
+        exchanged = "; it has those of the other side: exchange the files" if swapped else ""
+        raise InputError("E-TABLE-COLUMN-MISSING", f"{table.where}: {fault}, {needed}{exchanged}")
+    poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
+    common = table.common_errors(covariance, names[0] + "_")
+    return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
 
 
 def inverted(

@@ -145,14 +145,19 @@ def taken_at(stream: Stream, seconds: np.ndarray, names: Sequence[str], toleranc
     nearby = ~between & ~same & (gap_s <= tolerance_s)
     kept, left_out = between | same | nearby, []
     for k in np.flatnonzero(~kept).tolist():
-        where = f"in a gap of {spacing[k]:.3g} s of" if covered[k] else "outside of"
-        reason = f"{where} {stream.where}, {gap_s[k]:.4g} s from the nearest sample"
+        reason = f"{gap_s[k]:.4g} s {'before' if seconds[k] < samples[0] else 'after'} the samples of {stream.where}"
+        if covered[k]:
+            reason = f"in a gap of {spacing[k]:.3g} s of {stream.where}, {LONGEST_S:g} s allowed"
+            reason += f"; the nearest sample is {gap_s[k]:.4g} s away"
         left_out.append((names[k], f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)"))
     parts = [f"{same.sum()} at a sample"] if same.any() else []
     if between.any():
-        parts.append(f"{between.sum()} interpolated (cubic; samples {stream.spacing_s():.3g} s apart)")
+        turn, shift = stream.rest()
+        noise = "" if np.isnan(turn) else f", each within {shift:.2g} mm and {np.degrees(turn):.2g}° of the others"
+        parts.append(f"{between.sum()} interpolated (cubic; samples {stream.spacing_s():.3g} s apart{noise})")
     if nearby.any():
-        parts.append(f"{nearby.sum()} by the nearest sample, up to {gap_s[nearby].max():.3g} s away")
+        farthest = f"up to {gap_s[nearby].max():.3g} s away ({tolerance_s:g} s allowed)"
+        parts.append(f"{nearby.sum()} by the nearest sample, {farthest}")
     if left_out:
         parts.append(f"{len(left_out)} left out")
     message = f"poses by time: {len(seconds)} times in {len(samples)} samples of {stream.where}: {', '.join(parts)}"

@@ -13,9 +13,9 @@ import pytest
 from stcal.errors import InputError
 from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import read_pairs, read_two
+from stcal.handeye.data.pose_files import read_pairs, read_robot, read_two
 from stcal.handeye.data.pose_pairs import inverted
-from stcal.handeye.data.pose_partners import paired, partners
+from stcal.handeye.data.pose_partners import partners, rows_of_images
 from stcal.io.table import COVARIANCE
 from stcal.workflows.handeye_inputs import Files
 from tests.handeye.test_cli import NOISE
@@ -27,7 +27,6 @@ from tests.handeye.written import (
     message,
     moveit,
     poses_file,
-    read_robot,
     sides_of,
     table,
     tum,
@@ -86,30 +85,11 @@ def test_names_of_rows_are_those_of_images(tmp_path):
     columns = ",".join(f"base_from_flange_{c}" for c in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))
     row = "0.png,0.1,0.2,0.3,1,0,0,0\n"
     twice = read_robot(written(tmp_path / "poses.csv", f"image,{columns}\n{row}g/{row}"), Said())
-    assert paired(twice, ["g/0.png"], "images").left_out == (("0.png", "in poses.csv alone"),)
+    refuses("E-POSE-REPEATED … line 2 and line 3 … 'g/0.png'", rows_of_images, twice, ["g/0.png"])
     np.savez(tmp_path / "r.npz", base_from_flange=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
-    robot = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
-    found = paired(robot, ["a/0.png", "a/10.png", "a/7.png"], "in/a")
-    assert (found.robot.names, found.rows) == (("0", "10"), [0, 1])
-    assert found.left_out == (("1", "in r.npz alone"), ("a/7.png", "in a alone"))
-    refuses("E-POSES-UNMATCHED … a/1.png", paired, robot, ["a/1.png", "b/1.png"], "in")  # of two folders
-
-
-def test_tables_of_the_package_are_joined_by_their_names(tmp_path):
-    """Rows of one of them are named, and rows without names are not joined by their order."""
-    rows, names = [0, 1, 2, 4, 5, 6], [f"{i}.png" for i in range(len(PAIRS))]
-    first = table(tmp_path / "a.csv", {"base_from_flange": PAIRS.base_from_flange}, image=names)
-    second = table(tmp_path / "b.csv", {"": PAIRS.camera_from_board[rows]}, image=[names[i] for i in rows])
-    found = Files(first, second=second).read()
-    assert (found.left_out, found.understood) == ((("3.png", "in a.csv alone"),), ())
-    assert np.abs(found.pairs.camera_from_board.difference(PAIRS.camera_from_board[rows])).max() < ROUNDING
-    alone = table(tmp_path / "c.csv", {"camera_from_board": PAIRS.camera_from_board})
-    for error, files in (
-        ("E-TABLE-COLUMN-MISSING … shot … --key", Files(first, second=second, key="shot")),
-        ("E-TABLE-COLUMN-MISSING … c.csv … image", Files(first, second=alone)),
-        ("E-OPTION-NEEDS … --length-unit", Files(first, second=second, statements=Said(length_unit="m"))),
-    ):
-        refuses(error, files.read)
+    found = read_robot(tmp_path / "r.npz", Said(length_unit="mm"))
+    assert rows_of_images(found, ["a/0.png", "a/10.png", "a/7.png"]) == ({"a/0.png": 0, "a/10.png": 2}, ("1",), "")
+    refuses("E-IMAGE-NAME-AMBIGUOUS … pose 2 … 1 … a/1.png … b/1.png", rows_of_images, found, ["a/1.png", "b/1.png"])
 
 
 OWN = ",".join(f"base_from_flange_{c}" for c in ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"))
@@ -164,7 +144,7 @@ def test_a_dry_run_says_what_it_understood_and_what_motion_is_missing_and_writes
     for line, text in (
         (0, "robot: robot.csv: table; 12 poses; base_from_flange by default; a, b, c as Euler angles ZYX"),
         (1, "camera: camera.npy: NumPy array; 12 poses; camera_from_board by default; 4×4 matrices; mm by"),
-        (2, "rows joined by their order, for the robot's have no names: line 2 with pose 1"),
+        (2, "rows joined by their order, for neither file has names or times"),
         (3, "setup: eye-in-hand, as you say"),
         (4, "pairs: 12"),
     ):
@@ -212,8 +192,8 @@ def test_bad_cells_and_sides_identical_poses_a_board_that_did_not_follow_and_fal
         refuses(error, read_poses, path)
     flange, board = EIGHT.pairs.base_from_flange, EIGHT.pairs.camera_from_board
     every = {"base_from_flange": flange, "flange_from_base": flange.inverse(), "camera_from_board": board}
-    for sides, fault in (({"base_from_flange": flange}, "base_from_flange alone"), (every, "base_from_flange, flange")):
-        refuses(f"E-POSES-MIXED … {fault}", read_poses, table(tmp_path / "a.csv", sides))
+    for sides, fault in (({"base_from_flange": flange}, "no such columns … camera_from_board"), (every, "both … base")):
+        refuses(f"E-TABLE-COLUMN-MISSING … {fault}", read_poses, table(tmp_path / "a.csv", sides))
     rows = [0, 1, 2, 3, 1, 5]
     same = table(tmp_path / "poses.csv", {name: poses[rows] for name, poses in sides_of(EIGHT.pairs).items()})
     refuses("E-POSES-IDENTICAL … line 3 and line 6", read_poses, same)
@@ -346,7 +326,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         (TUM + TUM, ["line 1 and line 2 are both '1.5'"]),
         (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
         (TUM.replace("0.3", "nan"), ["not finite"]),
-        (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc"]),
+        (f"{EULER},a,b,c\n1,2,3,10,20,30\n", ["abc may be", "--rotation, like kuka-abc or mitsubishi-abc"]),
         (f"{EULER},q1,q2,q3,q4\n1,2,3,1,0,0,0\n", ["q1, q2, q3, q4 may be quaternions"]),
         (f"{EULER},euler_ZYX_1_deg,euler_ZYX_2_deg\n1,2,3,1,2\n", ["without euler_ZYX_3_deg; all 3 needed"]),
         (f"image,{EULER},rotvec_x_rad,rotvec_y_rad,rotvec_z_rad\na,1,2,3,0,0,0\na,1,2,3,0,0,1\n", ["are both 'a'"]),
@@ -356,7 +336,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         ("name: cell\n", ["no poses in keys name …"]),
         ("- {image: a, matrix: [1, 2]}\n", ["no poses in YAML"]),
         ('{"a.png": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', ["a.png: the 3×3 part is not a rotation"]),
-        ('{"samples": [{"robot": 1, "tracking": 1}]}', ["no poses in keys samples"]),
+        ('{"samples": [{"robot": 1, "tracking": 1}]}', ["sample 1: no translation x, y, z and rotation x, y, z, w"]),
     ],
 )
 def test_what_is_wrong_with_a_file_is_named(tmp_path, content, parts):
@@ -396,10 +376,10 @@ def test_the_file_of_the_other_side_and_samples_without_one_side_are_named(tmp_p
     text = Path(path).read_text()
     other = text.replace("object_wrt_sensor", "object", 2).replace("object", "object_wrt_sensor", 1)
     broken = written(tmp_path / "broken.yaml", other)
-    assert "pose 2 object_wrt_sensor: no 4×4 matrix" in refused(broken, call=read_pairs)
+    assert "pose 2: object_wrt_sensor is missing, which pose 1 has" in refused(broken, call=read_pairs)
     samples = [{"robot": message(GOOD[0]), "tracking": message(GOOD[0])}, {"robot": message(GOOD[1])}]
     path = written(tmp_path / "s.json", json.dumps({"samples": samples}))
-    assert "pose 2 tracking: no 4×4 matrix" in refused(path, call=read_pairs)
+    assert "sample 2: robot and tracking needed" in refused(path, call=read_pairs)
 
 
 def test_rows_of_two_files_that_do_not_fit(tmp_path):
@@ -410,7 +390,7 @@ def test_rows_of_two_files_that_do_not_fit(tmp_path):
     refuses("E-POSES-UNNAMED … b.npy … 100.5000", read_two, Path(a), tmp_path / "b.npy", Said(), "image")
     lines = Path(b).read_text().splitlines()
     late = written(tmp_path / "late.txt", "\n".join([lines[0], *(f"9{row}" for row in lines[1:])]))
-    said = "E-POSES-UNMATCHED … late.txt … 9100.5 … robot.txt … 8996 … 0.02"
+    said = "E-POSES-UNMATCHED … 9100.5 … 8996 … robot.txt … 0.02"
     refuses(said, read_two, Path(a), late, Said(), "image")
     fewer = written(tmp_path / "fewer.txt", "\n".join(lines[:3] + lines[4:]))
     told = read_two(Path(a), fewer, Said(), "image")
@@ -420,8 +400,7 @@ def test_rows_of_two_files_that_do_not_fit(tmp_path):
 @pytest.mark.parametrize(
     ("first", "second", "rows", "how"),
     [
-        (["a", "b"], ["b", "c"], [(1, 0)], "by names"),
-        (["x/a", "y/a"], ["y/a"], [(1, 0)], "by their names"),
+        (["a", "b"], ["b", "c"], [(1, 0)], ""),
         (["1.50", "2"], ["2.0", "1.5"], [(0, 1), (1, 0)], "by their times as numbers"),
         (["1500000000000000001"], ["1500000000.000000001"], [(0, 0)], "by their times as numbers"),
         (["x/a.png"], ["a.jpg"], [(0, 0)], "by names without folder and ending"),
@@ -442,6 +421,6 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     between = ";" if ";" in head else ","
     path = written(tmp_path / name, f"{head}\n{between.join('123456')}\n")
     said = Said(rotation="ur-rotvec")
-    for call in (Files(path, statements=said).read, Files(path, second=path, statements=said).read):
-        refuses("E-POSES-NOT-FOUND … u … base_from_flange_x_mm", call)
+    refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
+    refuses("E-POSES-NOT-FOUND … u", Files(path, second=path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", read_robot, path, said)
