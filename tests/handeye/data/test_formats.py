@@ -223,6 +223,12 @@ def test_covariances_are_read_and_turned_over(tmp_path):
     extra = {f"board_from_camera_{name}": inverse[:, i[k], j[k]] for k, name in enumerate(COVARIANCE)}
     sides = {"base_from_flange": EIGHT.pairs.base_from_flange, "board_from_camera": board.inverse()}
     pairs = read_poses(table(tmp_path / "poses.csv", sides, **extra))
+    flange = EIGHT.pairs.base_from_flange
+    other = {"flange_from_base": flange.inverse(), "camera_from_board": board}
+    for each in (pairs, read_poses(table(tmp_path / "m.csv", other, unit="m"))):
+        assert np.abs(each.base_from_flange.difference(flange)).max() < ROUNDING
+        assert np.abs(each.camera_from_board.difference(board)).max() < ROUNDING
+        assert each.names[:2] == ("line 2", "line 3")
     assert pairs.camera_from_board_covariance == pytest.approx(covariance, rel=1e-6, abs=1e-10)
     assert pairs.base_from_flange_covariance is None
     assert pairs[2:4].camera_from_board_covariance.shape == (2, 6, 6)

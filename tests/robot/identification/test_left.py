@@ -348,7 +348,7 @@ def as_it_is(q: np.ndarray) -> np.ndarray:
                 (mh80(), lambda q: np.roll(q, -1, axis=0), [], "one row further down"),
                 (mh80(), lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by +1"),
             ],
-            kept=(1, 2, 4),
+            kept=(1, 2, 3, 4),
         ),
     ],
 )
@@ -363,10 +363,18 @@ def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit()
     rng = np.random.default_rng(4)
     robot = mh80()
     data = measured(robot, joint_vectors(robot, 30, rng), rng)
-    rotations, said = Rotation.random(30, rng), "check the convention of the angles"
-    refuses(f"E-ROBOT-ORIENTATIONS … {said}", start, robot, replace(data, rotations=rotations.as_matrix()))
-    third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
-    start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
+    angles = Rotation.from_matrix(data.rotations).as_euler("xyz")
+    ways = (
+        Rotation.from_euler("xyz", angles[:, ::-1]),
+        Rotation.from_euler("xyz", angles * [1, -1, 1]),
+        Rotation.from_matrix(np.roll(data.rotations, 1, axis=0)),
+        Rotation.random(30, rng),
+    )
+    for wrong in (each.as_matrix() for each in ways):
+        said = "E-ROBOT-ORIENTATIONS … check the convention of the angles"
+        refuses(said, start, robot, replace(data, rotations=wrong))
+        third = np.where((np.arange(30) % 3 == 0)[:, None, None], wrong, data.rotations)
+        start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
 
 
 def test_an_instrument_that_moved_far_is_refused_with_the_column_that_mends_it():

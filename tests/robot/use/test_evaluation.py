@@ -288,11 +288,13 @@ def test_too_few_poses_other_units_and_wrong_poses_are_named(tmp_path):
     exchanged = ten_poses(lambda at: at[[0, 1, 6, 3, 4, 5, 2, 7, 8, 9]])
     assert exchanged.startswith("set after: poses P3 (")
     assert "P7 (" in exchanged
+    assert re.findall(r"P\d+", exchanged) == ["P3", "P7"]
     wrong = ten_poses(lambda at: at + far)
     assert wrong.startswith("set after: pose P5 (")
     assert ten_poses(lambda at: at + little).startswith("set after: pose P1 (")
     late = ten_poses(lambda at: np.roll(at, 1, axis=0))
     assert "check the order of the poses" in late
+    assert "check units" in ten_poses(lambda at: 1.1 * at)
     inches = ten_poses(lambda at: 25.4 * at)  # to the noise of 0.2 mm
     assert re.search(r"measured distances are 25\.[34]\d* times the commanded ones.*check units", inches)
 
