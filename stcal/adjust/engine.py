@@ -335,8 +335,7 @@ class Solution:
                 yield rows.factor.cluster[batch], slope, rows.residual[batch]
 
     def _ways(self, along: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return by block how its members (n, dim, q) change by ``along`` (k, q), of each kept unknown by itself if
-        None, eliminated members going with it."""
+        """Return by block how its members (n, dim, q) change by ``along`` (k, q), or by each kept unknown if None."""
         every = np.eye(self.kept) if along is None else along
         kept = {b.name: (len(b.start), b.start.dim, every.shape[1]) for b in self.problem.blocks if not b.eliminate}
         ways = {name: every[self.places[name]].reshape(shape) for name, shape in kept.items()}

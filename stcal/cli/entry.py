@@ -63,8 +63,7 @@ def _print_version() -> None:
 
 
 def _program() -> ModuleType:
-    """Loads and returns the module of the commands, which use one thread of OpenBLAS: where memory is too little for
-    its threads, it sends its own process SIGINT, or tries for ever."""
+    """Loads and returns the module of the commands, with one thread of OpenBLAS: it may hang where memory is short."""
     _answer()
     _require_address_space()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -376,8 +376,7 @@ def compare(
 
 
 def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
-    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says. ``fit`` : whether the fit is
-    what is used, so that its quality is printed, or the lens itself."""
+    """Returns the lens of a file, and prints the quality of a ``fit``, or what EXIF says."""
     from stcal.io.cameras.difference import load_lens
     from stcal.io.cameras.read import SIGMA_FOCAL
     from stcal.report.camera_figures import fitted_text

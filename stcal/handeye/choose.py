@@ -153,8 +153,7 @@ def _shown(result: HandEye, problem: HandEyeProblem, share: float = 1.0) -> bool
 
 
 def _best(tried: list[Tried], rows: np.ndarray, split: int | None = None) -> Tried:
-    """Returns the first of the tried that is not behind the best by more than chance, without the poses of the
-    ``split``; none that solves for what these poses do not show. ``rows`` : (s, k) poses held out."""
+    """Returns the first of the tried that is behind the best by chance only, with poses held out (s, k) as ``rows``."""
     if split is not None:
         others = np.where(np.isin(rows, rows[split]), -1, rows)
         rows = rows if (others < 0).all() else others  # a single split: no other poses were held out
@@ -171,8 +170,7 @@ def _first_of(tried: list[Tried], rows: np.ndarray) -> Tried:
 
 
 def _behind(one: Tried, other: Tried, rows: np.ndarray) -> float:
-    """Returns the mean over poses of the error of one minus that of the other, in standard errors of this difference;
-    0 where it is not positive. ``rows`` (s, k) below 0 are ignored."""
+    """Returns by how many standard errors one's mean error of held-out poses (s, k) exceeds the other's; at least 0."""
     off, valid = one.error_mm - other.error_mm, rows >= 0
     means = np.array([off[valid & (rows == pose)].mean() for pose in np.unique(rows[valid])])
     standard_error = float(means.std(ddof=1) / np.sqrt(len(means))) if len(means) > 1 else 0.0

@@ -152,8 +152,7 @@ def _changed(loop: Loop, change: Callable[[Poses], Poses], *sides: str) -> Calla
 
 
 def _inverted(loop: Loop, by_images: bool) -> Candidate:
-    """Returns the loop with one side inverted. As a board is in front of its camera, that side is known unless the
-    poses have the board in front in both directions."""
+    """Returns the loop with one side inverted: that which puts the board in front of the camera, if only one does."""
     seen = loop.camera_from_board
     robot, camera = SIDES["robot"][1], SIDES["camera"][1]
     front, front_inverted = (bool((poses.translation[:, 2] > 0).all()) for poses in (seen, seen.inverse()))
@@ -170,8 +169,7 @@ def _inverted(loop: Loop, by_images: bool) -> Candidate:
 
 
 def _variants(loop: Loop, by_images: bool) -> Iterator[Candidate]:
-    """Yields the loop with a side inverted, mirrored, in another unit, or beside another row, or with quaternions in
-    another order. ``by_images`` : the board's poses were computed here from images."""
+    """Yields the loop with a side inverted, mirrored, in another unit, by another row, or with other quaternions."""
     hand, eye = loop.base_from_flange, loop.camera_from_board
     yield _inverted(loop, by_images)
     # Residuals show only the ratio of two units; lengths beyond a hall tell which side it is.

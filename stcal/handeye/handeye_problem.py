@@ -391,8 +391,7 @@ class HandEyeProblem:
         return notes
 
     def _by_true_robot(self, solved: Callable[[Loop, Noise], Adjusted]) -> tuple[Adjusted, Noise, Remarks]:
-        """Returns the solution by the robot's stated σ, and these; or by estimated ones, and a note, if poses
-        contradict the stated: errors of a robot held too tightly appear in camera and board instead."""
+        """Returns the solution by the robot's stated σ, or if poses contradict these, by estimated ones."""
         noise, loop = self.options.noise, self.loop
         solution, stated = solved(loop, noise), loop.robot_covariance
         if stated is not None:

@@ -133,8 +133,7 @@ def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray
 
 
 def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
-    the poses, or those from the σ of the result."""
+    """Returns covariances (6, 6) of a pose of flange and board: the mean of the stated, or from the result's σ."""
     sigma = result.sigma
     robot, camera = (
         np.diag(np.square(np.repeat([sigma.get(f"{side}_{unit}", 0.0) for unit in ("rad", "mm")], 3)))

@@ -160,8 +160,7 @@ def _field(problem: Problem, transform: Transform, variance: np.ndarray, rows: n
 
 
 def _at_length(covariance: np.ndarray, columns: np.ndarray) -> tuple[float, float, float]:
-    """Returns the best ratio of the variance of f, of unit ``covariance`` (m, m), to that of the noise, −2 log L there,
-    and −2 log L without f, by restricted likelihood. ``columns`` : (m, 3, p + 1) motions and residuals."""
+    """Returns by restricted likelihood the ratio of f's variance to the noise's, and −2 log L with and without f."""
     m, _, width = columns.shape
     flat = columns.reshape(m, -1)
     # A tridiagonal form Q T Qᵀ takes a third of the time of eigenvectors.

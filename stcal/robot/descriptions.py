@@ -436,11 +436,7 @@ def _of_kinematics(content: dict, where: str, convention: Convention) -> UrdfRob
 
 
 def _of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> UrdfRobot:
-    """Returns the arm of a calibration.conf: the one of its [DH] section or ``nominal``, and its deviations.
-
-    Axes of upper arm, forearm and wrist are nearly parallel: the controller's rows have lengths of many metres that
-    cancel, written here as rows with Hayati's angle.
-    """
+    """Returns the arm of a calibration.conf: its [DH] or ``nominal``, and deviations, by Hayati's angle."""
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
 
     def six(key: str) -> np.ndarray:

@@ -276,8 +276,7 @@ def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _agreeing(
     residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray, estimated: bool
 ) -> np.ndarray:
-    """Returns which poses, (m,), agree with the solution of all others: by squared residuals over their own variance,
-    less than the pose's for poses that took part, plus the solution's for the others."""
+    """Returns which poses, (m,), agree with the solution of all others, by squared residuals over their variance."""
     m, count = len(used), jacobian.shape[2]
     redundancy = 6 * int(used.sum()) - count - 6
     if redundancy < 6:

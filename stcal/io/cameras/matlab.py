@@ -85,9 +85,7 @@ def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
 
 
 def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
-    """Return the number of elements in a row, each of which must have a type that exists and a size that is there.
-    SciPy follows any other type into foreign memory, which ends the process. ``order`` : ``<`` or ``>`` for the
-    order of bytes; ``arrays`` : whether arrays may be among them."""
+    """Return the number of elements in a row, each of a known type and whole: SciPy would read foreign memory."""
     at = count = 0
     while at < len(data):
         count += 1

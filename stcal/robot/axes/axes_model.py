@@ -251,9 +251,7 @@ def slopes_of(frames: list[Rigid], nominal: Robot) -> np.ndarray:
 
 
 def _values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
-    """Returns the rows (5 n,) of the robot with these axes, and values (6 (n − 1),) of the pairs: the acute angle as a
-    vector (3), the rows' distance, and the common normal's length and foot from the axis's origin (nan with a prismatic
-    joint)."""
+    """Returns the rows (5 n,) of the robot with these axes, and (6 (n − 1),): angles (3), distances, normals, feet."""
     robot = robot_from_chain(_chain_through(frames, nominal), {}, nominal)
     values = np.full((len(frames) - 1, 6), np.nan)
     for i, (axis, next_axis) in enumerate(pairwise(frames)):
@@ -403,8 +401,7 @@ def _remarks(
 
 
 def _leave_one_out(data: Measurements, fits: list[AxisFit], nominal: Robot, slopes: np.ndarray) -> LeaveOneOut:
-    """Returns the values of the pairs without each row, by its influence; ``slopes`` : of :func:`_values` by the
-    joints' own fits."""
+    """Returns the pairs' values without each row, by influence; ``slopes`` : of :func:`_values` by the fits."""
     groups, counts = defaultdict(list), Counter()  # rows measured together: the same joint values, each reflector once
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
         key = q.tobytes()

@@ -325,8 +325,7 @@ class AxisFit:
         return fit
 
     def _started(self, moved: np.ndarray) -> "AxisFit":
-        """Returns the axis from all points; if some stand out, from the subset with the least median residual. A subset
-        leaves out one point, or all points at one value of the joint ``moved`` (k,)."""
+        """Returns the axis from all points, or from the subset (less one point or value) of least median."""
         count, sets = len(self.rows), [np.ones(len(self.rows))]
         for each in (np.arange(count), np.unique(moved, return_inverse=True)[1]):
             groups = each % STARTS

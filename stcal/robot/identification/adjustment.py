@@ -250,8 +250,7 @@ class Weighting:
         return self._whitened(white[..., None], measured, back=True)[..., 0]
 
     def _whitened(self, values: np.ndarray, measured: Observed, back: bool) -> np.ndarray:
-        """Returns W values (r, w, k), or Wᵀ values if ``back``. WᵀW is the inverse covariance: of independent errors,
-        and of common ones F, which leave (1 + F Fᵀ)^-½ where the others have σ 1."""
+        """Returns W values (r, w, k), or Wᵀ values if ``back``; WᵀW is the inverse covariance with common errors F."""
         width = values.shape[1]
         if not self.given or width == 1:
             sigma = self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:]

@@ -187,8 +187,7 @@ def _turns_as_computed(first: State, data: Measurements) -> bool:
 
 
 def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
-    """Returns the weighting at the start. If all σ are given, they are weights that σ₀ multiplies; one of two σ is
-    exact. σ that are not given start at the misfit, so that no observation is an outlier at first."""
+    """Returns the weighting at the start: by stated σ times σ₀; σ that are not given start at the misfit."""
     sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
     needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
     missing = tuple(name for name in needed if sigma[name] is None)
@@ -217,8 +216,7 @@ def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: Nomi
 
 
 def _without_errors(problem: ArmProblem, state: State, good: np.ndarray, rounds: int = VARIANCE_ROUNDS) -> ArmSolution:
-    """Solves, removes gross errors, and solves again until their set (``good`` is the first) stays the same. Huber
-    weights bound an outlier's pull, but no covariance shows it."""
+    """Solves and removes gross errors until their set stays the same: no covariance shows a bounded outlier's pull."""
     for _ in range(OUTLIER_ROUNDS + 1):
         solution = _settled(problem.of(good), state, rounds)
         if not good.all():

@@ -106,8 +106,7 @@ class _Effect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """A finding with the logarithm of its probability by chance and its ``motions`` (r, w, c). ``root`` : (r,) roots of
-    the weights of the rows beside it, 0 for errors."""
+    """A finding, its log chance, its ``motions`` (r, w, c), and roots (r,) of the weights of the rows, 0 for errors."""
 
     finding: Effect
     log_p: float
@@ -170,8 +169,7 @@ class _Rest:
         return _Found.of(finding, log_p + float(np.log(len(tried) + others)), candidate.motions, self.root)
 
     def _tested(self, values: np.ndarray) -> tuple[float, np.ndarray] | None:
-        """Returns the F test of what ``values`` (N, c) add: log p, and the part (N,) of the residuals that it explains;
-        None if nothing, or without degrees of freedom."""
+        """Returns log p of the F test of what ``values`` (N, c) add, and what they explain (N,); None if nothing."""
         values = _unit(values)
         new = _basis(values - self.fitted @ (self.fitted.T @ values), NEW)
         c = new.shape[1]

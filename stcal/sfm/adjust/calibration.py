@@ -215,8 +215,7 @@ def _outward(joint: JointResult, target_from_face: Mapping[str, Rigid]) -> np.nd
 def _faces(
     models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Returns the frames of the faces in all groups, and notes. Frame circles that a group lacks are placed by the
-    others, as other groups have them; the joint adjustment starts from there."""
+    """Returns the frames of the faces in all groups, frame circles that one lacks placed by others, and notes."""
     results = [chain.faces_of_group(model, camera, target, options.frame) for model in models]
     places: dict[str, dict[str, list[np.ndarray]]] = {}
     for face in (face for group_faces, _ in results for face in group_faces):
@@ -232,8 +231,7 @@ def _faces(
 def _adjust_all(
     models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options, prior, rounds: int, step
 ) -> tuple[Adjusted, SigmaFactors]:
-    """Runs joint adjustments; returns the last state and the factors on the centres' σ. Eccentricity, and for a refined
-    camera the factors, are computed again before each."""
+    """Runs joint adjustments, eccentricity new before each; returns the last state and factors on the centres' σ."""
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
     current, shape_factors = camera, UNKNOWN_SHAPES

@@ -268,8 +268,7 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
 def _adjust(
     faces: Sequence[FaceInGroup], from_face: dict[str, Rigid], from_group: dict[str, Rigid], reference: str
 ) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Estimates the poses of faces and groups in the target frame: what each group sees of a face, with the
-    information of its circles, ties one of either."""
+    """Estimates poses of faces and groups in the target frame; what a group sees of a face ties one of either."""
     roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
     for own in faces:
         by_pose = np.concatenate([-skew(own.xyz_face), np.broadcast_to(np.eye(3), (len(own.labels), 3, 3))], axis=2)

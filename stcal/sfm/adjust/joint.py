@@ -198,8 +198,7 @@ def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors)
 
 
 def _shape_factors(setting: Setting, solution: JoinedSolution) -> ShapeFactors:
-    """Returns print and bend factor, variance components (Förstner 1979) with the stated σ as a weak prior, and the
-    amplitude of the prints' smooth deviations."""
+    """Returns print and bend factor (Förstner 1979; stated σ as weak prior), and the prints' smooth amplitude."""
     square, freedom, prints = np.zeros(2), np.zeros(2), []
     for shape in equations.shapes(solution.values[CIRCLES].array, setting):
         place = equations.coordinates(shape.members)

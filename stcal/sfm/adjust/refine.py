@@ -316,8 +316,7 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
 
 
 def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outlier]]:
-    """Returns the worst observation of each image near the worst of all: a bad one affects others that share its point
-    or camera."""
+    """Returns the worst observation of each image near the worst of all: it affects those it shares a point with."""
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     rms = np.sqrt(2) * robust_sigma(residual, 2)
     limit = np.maximum(np.maximum(OUTLIER_RMS * rms, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)

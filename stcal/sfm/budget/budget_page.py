@@ -133,8 +133,7 @@ def _is_valid(file: BudgetFile) -> bool:
 
 
 def _no_certificate(file: BudgetFile, brief: bool = False) -> str:
-    """Returns why a valid budget is no certificate, ``brief`` without keys; empty if it is one. Faces that need not be
-    flat need no statement."""
+    """Returns why a valid budget is no certificate, ``brief`` without keys; empty if it is one."""
     if not _is_valid(file):
         return ""
     if file.reserved:

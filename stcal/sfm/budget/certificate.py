@@ -101,8 +101,7 @@ def _outermost(xy: np.ndarray) -> np.ndarray:
 
 
 def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
-    """Draws the circles of a face in its own frame; ``out`` : -1 where its Z axis leads into the body, so that Y is
-    drawn downwards."""
+    """Draws the circles of a face in its frame; ``out`` : -1 where Z leads into the body, and Y is drawn downwards."""
     drawing = Drawing(3.3, 2.6)
     xy = np.array(list(xyz.values()))[:, :2] * [1.0, out]
     reach = 0.25 * float(np.ptp(np.vstack([xy, [[0, 0]]]), axis=0).max())
@@ -119,8 +118,7 @@ def _face(xyz: dict[str, np.ndarray], out: float) -> Drawing:
 
 
 def _item(circles: dict[str, dict[str, np.ndarray]], poses: dict[str, Rigid], out: dict[str, float]) -> Drawing:
-    """Draws the faces with their frames from where most of them are seen; Y of the reference frame is up. Faces that
-    look away are pale."""
+    """Draws faces and frames, Y of the reference up, from where most are seen; those that look away are pale."""
     drawing = Drawing(3.3, 2.6)
     normals = {face: out[face] * poses[face].rotation[:, 2] for face in circles}
     # Evenly on a sphere, but not along Y, which is up.

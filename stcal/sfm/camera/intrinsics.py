@@ -450,8 +450,7 @@ def model_of_views(views: Sequence[ImageObservations], board: BoardDesign, camer
 
 
 def _weighted(fit: Fit, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> Fit:
-    """Returns the fit with scaled σ of the centres, larger ones in photographs whose residuals exceed those of most by
-    far, and updated eccentricity."""
+    """Returns the fit with scaled σ, larger in photographs whose residuals stand out, and new eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
     scaled = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(fit.models, own, strict=True)]
     lengths = replace(fit, models=tuple(scaled)).lengths()

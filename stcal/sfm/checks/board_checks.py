@@ -155,8 +155,7 @@ def board_checks(evidence: Evidence) -> list[Check]:
 
 
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
-    """Returns dots minus grid after a similarity, (3d,) mm, their weight matrix with the group's noise, and their
-    cells."""
+    """Returns dots minus grid after a similarity, (3d,) mm, their weights with the group's noise, and their cells."""
     labels = [network.model.labels[i] for i in dots]
     cells = dot_cells(labels)
     design = board.places_mm(labels)
@@ -283,8 +282,7 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
 def _sources(
     network: Network, board: BoardDesign, print_factor: float
 ) -> tuple[Sequence[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the s sources of the scale: their names, the logarithm of the model's scale over the known size (s,), its
-    gradient by the points (s, 3p), and the variance of the known size (s,)."""
+    """Returns names, log of model over known size (s,), gradient (s, 3p) and variance of the sources of the scale."""
     model = network.model
     parts = [
         (f"face {face.id}", members, face.places_mm(model.labels[i].circle for i in members),

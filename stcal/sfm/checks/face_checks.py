@@ -136,8 +136,7 @@ def groups_check(evidence: Evidence, joint: JointResult) -> Check:
 
 
 def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int, float]:
-    """Returns what a joint adjustment adds to the squared residuals of its groups, the degrees of freedom of that, and
-    those of the groups."""
+    """Returns squared residuals that a joint adjustment adds to its groups' own, and both degrees of freedom."""
     free = float(sum(n.redundancy.sum() for n in networks))
     square = float(sum((n.residual**2).sum() for n in networks))
     return max(joint.sigma0**2 * joint.redundancy - square, 0.0), round(joint.redundancy - free), free

@@ -298,8 +298,7 @@ def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> Fitt
 
 
 def _applies(fitted: FittedCause, networks: Sequence[Network], camera: Camera) -> bool:
-    """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, or in each image 1 or 0,
-    groups differ, and a few images do not explain it alone."""
+    """Whether estimates are of a cause of the whole set: 1 as a whole, 1 or 0 by image, and not of few images alone."""
     cause, estimate, variance = fitted.cause, fitted.test.estimate, np.diag(fitted.test.covariance)
     if cause.whole and cause.scope == "all":
         return bool(abs(estimate[0] - 1) < FIXED_WITHIN)

@@ -215,8 +215,7 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
 
 
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
-    """Returns the pose of an image with the most planes, then faces, then circles, and the readings that agree with it;
-    None if several fit."""
+    """Returns the pose with most planes, faces and circles, and the readings that agree; None if several fit."""
     found: list[tuple[tuple[int, int, int], Rigid, list[PlaneView]]] = []
     for views in readings:
         others = [v for v in readings if v is not views]

@@ -471,8 +471,7 @@ def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: E
 
 
 def _rims(fits: Fits) -> dict[str, np.ndarray]:
-    """Returns n fitted ellipses by the names of :class:`Centres`, ideal px; contrast and rim are zero if a fit failed.
-    ``covariance`` is for independent pixels, ``chance`` for :func:`correlation`."""
+    """Returns n ellipses by the names of :class:`Centres`, ideal px; 0 as contrast and rim where a fit failed."""
     n = len(fits.blur)
     near = (np.abs(fits.reduced) * fits.blur[:, None] < np.maximum(1.5, fits.blur)[:, None]) & (fits.real > 0)
     angle = np.arctan2(fits.on_unit[:, 1][near], fits.on_unit[:, 0][near])

@@ -290,8 +290,7 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
 def _without_copies(
     outcomes: list[DetectedImage | Skipped], forms: bool, grouped: bool
 ) -> tuple[list[DetectedImage], list[Skipped]]:
-    """Returns the images without copies of photographs, and the files that are skipped. Of equal content the plainest
-    name stays, of several ``forms`` the lossless one; if ``grouped``, none of a photograph that is in two groups."""
+    """Returns the images without copies of photographs, of which the plainest name stays, and the files skipped."""
     detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
     same: dict[str, list[ImageFile]] = {}
     for image in sorted(detected, key=lambda image: _plainness(image.file)):

@@ -260,8 +260,7 @@ def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
 def _placements(
     candidates: Candidates, uv, index, board: BoardDesign, homography, image_corners
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Returns the placements of the board over the grid, the likeliest first: number of dots that are outside of it, or
-    expected and missing; mask of the dots on it; their row and column."""
+    """Returns placements of the board, likeliest first: dots outside or missing, mask of those on it, their cells."""
     size, all_cells = np.array([board.columns, board.rows]), board.cells()[:, ::-1]
     has_dot = np.zeros(size[::-1], bool)
     has_dot[tuple(all_cells[:, ::-1].T)] = True

@@ -385,8 +385,7 @@ def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardD
 
 
 def _numbered(views: Sequence[Readings]) -> list[PlaneView | str]:
-    """Returns the numbering of each image, or why it has none. Next is what turns least from a numbered image; the
-    first has the fewest numberings and the most dots."""
+    """Returns the numbering of each image, or why it has none: next is what turns least from a numbered image."""
     chosen: list[PlaneView | str] = [""] * len(views)
     unsettled = {i: numberings for i, numberings in enumerate(views) if numberings}
     if unsettled:

@@ -403,8 +403,7 @@ def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float
 
 
 def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraRow]:
-    """Returns the differences of camera positions and attitudes relative to the target; those in σ are relative to the
-    circles of their group, the covariances' datum."""
+    """Returns differences of camera poses relative to the target; in σ, to their group's circles."""
     factors = run.sigma_factors()
     model_of_group = {model.group: model for model in b.models}
     rows = []

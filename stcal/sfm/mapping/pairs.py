@@ -259,8 +259,7 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _join_tracks(joined: np.ndarray, seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:
-    """Joins images until those of every circle are as connected as all pairs would make them: ``preferred`` ones first,
-    then those with most labels in common."""
+    """Joins images, ``preferred`` ones first, until every circle's are as connected as all pairs would make them."""
     for images in map(np.flatnonzero, seen.T):
         among = np.ix_(images, images)
         if connected_components(joined[among], directed=False)[0] == 1:
