@@ -8,10 +8,8 @@ from stcal.errors import StcalError
 
 
 def dealt(count: int, folds: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Deals rows 0 … count - 1 at random to folds whose sizes differ by at most one, each in ascending order.
-
-    There are at most as many folds as rows, and none if that leaves fewer than two.
-    """
+    """Deals rows 0 … count - 1 at random to folds whose sizes differ by at most one, each in ascending order. There are
+    at most as many folds as rows, and none if that leaves fewer than two."""
     folds = min(folds, count)
     if folds < 2:
         return []
@@ -31,14 +29,9 @@ def repeated_splits(count: int, size: int, repeats: int, rng: np.random.Generato
 def held_out_errors(
     ways: Sequence[Callable[[np.ndarray, np.ndarray], np.ndarray]], folds: Sequence[np.ndarray]
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """Returns the errors on each fold's rows of fits to the other folds.
-
-    ``ways`` : functions of (rows to fit to, rows (m,) to test on) that return the errors (m,); ``folds`` : rows of each
-    fold.
-
-    Returns the number of folds done, their rows (m,) in ascending order, and the errors (ways, m). A fold that one of
-    the ways cannot solve is left out for all ways.
-    """
+    """Returns the number of folds done, their rows (m,) in ascending order, and the errors (ways, m) of each fold's
+    rows by fits to the others. A fold that one way cannot solve is left out for all. ``ways`` : functions of (rows to
+    fit to, rows (m,) to test on) that return the errors (m,); ``folds`` : rows of each fold."""
     rows, errors = [np.zeros(0, int)], [np.zeros((len(ways), 0))]
     for fold in folds:
         training = np.setdiff1d(np.concatenate(folds), fold)

@@ -29,15 +29,11 @@ class Candidate:
 def explain(
     candidates: Iterable[Candidate], fit: Callable[[Any], float], most: float, alike: float = ALIKE
 ) -> list[tuple[Candidate, float]]:
-    """Return the candidates that explain the data, with their misfits, the best first; several if the data cannot tell.
-
-    Candidates of one size are tried together, the smallest first; larger changes are tried only if no smaller one
-    explains the data. Nothing is named if none does.
-
-    ``fit`` : returns the misfit of a changed input; an input that gives no solution (DegenerateError,
-    ConvergenceError) explains nothing; ``most`` : misfit below which a candidate explains the data; ``alike`` : ratio
-    of misfits up to which candidates of one size are told with the best one.
-    """
+    """Return the candidates that explain the data, with their misfits, the best first; several if the data cannot
+    tell, none if none does. Those of one size are tried together; larger changes only if no smaller one explains the
+    data. ``fit`` : returns the misfit of a changed input; one without a solution explains nothing; ``most`` : misfit
+    below which a candidate explains the data; ``alike`` : ratio of misfits up to which candidates are told with the
+    best one."""
 
     def misfit(candidate: Candidate) -> float:
         try:

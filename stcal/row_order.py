@@ -38,17 +38,11 @@ class Change:
 
 
 def change_along(errors: np.ndarray, explained: np.ndarray, motions: np.ndarray) -> Change | None:
-    """Returns the jump or the drift that explains residuals best, however improbable it is by chance.
-
-    The F test of each place of a jump, and of a drift, is made in the space that the fitted parameters leave open;
-    probabilities are multiplied by their number (Bonferroni). Rows that fit neither side are left out.
-
-    ``errors`` : (r, w) residuals in units of one common σ, in the order of measurement; ``explained`` : (r, w, k)
-    derivatives by the fitted parameters, in the same units; ``motions`` : (r, w, c) effects of the motions that may
-    have happened, in the same units.
-
-    Returns None if there are too few rows, or the parameters explain any such change.
-    """
+    """Returns the jump or the drift that explains residuals best, however improbable it is by chance; None if there are
+    too few rows, or the parameters explain any such change. The F test of each place is made in the space that the
+    fitted parameters leave open; probabilities are multiplied by their number (Bonferroni). ``errors`` : (r, w)
+    residuals in units of one common σ, in the order of measurement; ``explained`` : (r, w, k) derivatives by the fitted
+    parameters; ``motions`` : (r, w, c) effects of the motions that may have happened."""
     return changes_along(errors, explained, [motions])[0]
 
 

@@ -53,10 +53,8 @@ class Equations:
         return Equations(*numbers)
 
     def alone(self, held: float = 0.0) -> "tuple[np.ndarray, np.ndarray, Reduction]":
-        """Return normal matrix and right side of the kept unknowns alone, and the elimination of the others.
-
-        ``held`` : share of each unknown's information that is added; one on which nothing depends stays.
-        """
+        """Return normal matrix and right side of the kept unknowns alone, and the elimination of the others. ``held`` :
+        share of each unknown's information that is added; one on which nothing depends stays."""
         normal, block = self.normal.copy(), self.block.copy()
         for diagonal in (np.einsum("kk->k", normal), np.einsum("maa->ma", block)):
             diagonal[:] = np.where(diagonal > 0, (1 + held) * diagonal, 1.0)
@@ -87,11 +85,9 @@ class Components:
         return np.array([own.flat() for own in self.each]), self.fixed.flat(), counted
 
     def at(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """Evaluate the posterior at x (p,), by restricted maximum likelihood (Patterson & Thompson 1971).
-
-        Return log posterior density, its gradient (p,), the step of the kept unknowns (k,) from the state, and their
-        covariance (k, k).
-        """
+        """Evaluate the posterior at x (p,), by restricted maximum likelihood (Patterson & Thompson 1971). Return log
+        posterior density, its gradient (p,), the step of the kept unknowns (k,) from the state, and their covariance
+        (k, k)."""
         share, (each, fixed, counted) = np.exp(-2 * x), self._flat
         whole = self.fixed.filled(share @ each + fixed)
         normal, right, reduction = whole.alone(self.held)
@@ -138,12 +134,10 @@ def component_variances(
     bounds: tuple[np.ndarray, np.ndarray],
     caution: float = 0.0,
 ) -> np.ndarray:
-    """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components.
-
-    Of residuals (m, a) near a solution and their derivatives (m, a, k) by what was solved for; ``known`` : (m, a, a)
-    part of the covariances; ``free`` : (f, m, a, a) components, each to be multiplied by its variance, from ``first``
-    (f,) and within ``bounds``; ``caution`` : redundancy of each variance that is not counted.
-    """
+    """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components. Of residuals (m,
+    a) near a solution and their derivatives (m, a, k) by what was solved for; ``known`` : (m, a, a) part of the
+    covariances; ``free`` : (f, m, a, a) components, each to be multiplied by its variance, from ``first`` (f,) and
+    within ``bounds``; ``caution`` : redundancy of each variance that is not counted."""
     flat = jacobian.reshape(-1, jacobian.shape[2])
     u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
     jacobian = u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)  # an orthonormal basis of its columns

@@ -152,9 +152,7 @@ def one_sheet(parts: Sequence[Piece], title: str) -> Sheet:
 
 def paper_sheets(parts: Sequence[Piece], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
-
-    A part that is larger than a sheet only by its dimensions is drawn without them.
-    """
+    A part that is larger than a sheet only by its dimensions is drawn without them."""
     split = [min(_ways(part, paper), key=lambda way: (way.cuts, way.count, way.bare)) for part in parts]
     total = sum(way.count for way in split)
     if total > MOST_SHEETS:

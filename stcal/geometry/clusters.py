@@ -36,10 +36,7 @@ class ByClusters:
 
 def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.ndarray:
     """Return what clusters would show, of unit variance, (…, k), had they not taken their share (…, k, k) in the
-    answer.
-
-    ``power`` : 0.5 for the variance of independent errors (CR2), 1 for the answer without the cluster (CR3)
-    """
+    answer. ``power`` : 0.5 for the variance of independent errors (CR2), 1 for the answer without the cluster (CR3)"""
     taken, axes = np.linalg.eigh((share + np.swapaxes(share, -1, -2)) / 2)
     along = (np.swapaxes(axes, -1, -2) @ values[..., None])[..., 0] / (1 - np.clip(taken, 0, MOST_SHARE)) ** power
     return (axes @ along[..., None])[..., 0]
@@ -47,10 +44,8 @@ def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.nd
 
 def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -> ByClusters:
     """Return the covariance of parameters at a minimum with a normal matrix (q, q), priors included, from n clusters.
-
     ``pull`` : (n, q) half the downhill gradient of each cluster's cost, other unknowns eliminated; ``information`` :
-    (n, q, q) each cluster's part of ``normal``
-    """
+    (n, q, q) each cluster's part of ``normal``"""
     own = np.diag(normal)
     scale = np.sqrt(np.where(own > 0, own, 1.0))
     value, vector = np.linalg.eigh(normal / scale[:, None] / scale)

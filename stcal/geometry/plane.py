@@ -212,11 +212,10 @@ def two_minima(
     descend_near: Callable[[Poses], Descend], start: Poses, target_from_plane: Rigid, failure: str, planar: bool = True
 ) -> tuple[Minima, float]:
     """Return one or two distinct minima of the residuals of single points, the better one first, and the length, in
-    stated σ, beyond which a residual is an outlier. ``descend_near`` : whitens residuals near one pose, alike for both
-    minima, and returns the descent; ``start`` : one pose, to which its mirror image is added, or two, the likelier one
-    first; ``target_from_plane`` : origin in the middle of the points, Z along the normal; ``planar`` : whether all
-    points are in the plane, so that two starts that end alike may have been on one side, and the mirror image of their
-    minimum is tried."""
+    stated σ, beyond which a residual is an outlier. ``descend_near`` : whitens residuals near one pose, and returns the
+    descent; ``start`` : one pose, to which its mirror image is added, or two; ``target_from_plane`` : origin in the
+    middle of the points, Z along the normal; ``planar`` : whether all points are in the plane, so that the mirror image
+    of a lone minimum is tried."""
     poses = start + mirrored(start, target_from_plane) if len(start) == 1 else start
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger

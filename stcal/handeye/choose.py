@@ -185,18 +185,11 @@ def choose(
     workers: int | None = 1,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> ChosenWay:
-    """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form.
-
-    A candidate with unknown board or camera takes part where they differ from their files by more than chance.
-    :func:`~stcal.handeye.validate.deciding_error` on held-out poses decides. Solutions without some poses are one step
-    from the solution of all.
-
-    ``problem`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
-    None; ``rows`` : (s, k) poses to hold out in each split; ``progress`` : called with the number of solutions done,
-    and of all.
-
-    Raises StcalError: the first candidate, which trusts all files, fails.
-    """
+    """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form;
+    held-out poses decide (:func:`~stcal.handeye.validate.deciding_error`). A candidate with unknown board or camera
+    takes part where they differ from their files by more than chance. ``problem`` : its scale and intrinsics are
+    overwritten; ``prior`` : of the intrinsics, which are never solved for if None; ``rows`` : (s, k) poses to hold out
+    in each split. Raises StcalError: the first candidate, which trusts all files, fails."""
     problem = problem.mended()
     for out in rows:
         with naming_held_out(problem, out):

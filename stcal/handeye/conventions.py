@@ -36,11 +36,9 @@ Guess = Callable[[Loop, bool], LoopState]
 
 def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale: bool, by_images: bool) -> Remarks:
     """Refuse poses that fit far better in another convention, or in none; return notes on what the fit cannot decide.
-    With both sides inverted, X and Z change places, and only a board behind the camera shows it.
-
-    ``guess`` : returns X, Z and scale of a loop; ``by_images`` : the board's poses come from images, so that only the
-    robot's can be named wrongly. Raises InputError: the message says what is mixed up, and the remedy.
-    """
+    With both sides inverted, X and Z change places, and only a board behind the camera shows it. ``guess`` : returns X,
+    Z and scale of a loop; ``by_images`` : the board's poses come from images, so that only the robot's can be named
+    wrongly. Raises InputError: the message says what is mixed up, and the remedy."""
     turn, shift = as_read = _typical(loop, guess, with_scale)
     notes: Remarks = ()
     if turn > WELL[0] or shift > WELL[1]:
@@ -229,12 +227,9 @@ def repair(
     pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None
 ) -> tuple[HandEyePoses, Views | None, np.ndarray]:
     """Give all views the most common numbering of a symmetric board. Angle and advance of robot and camera between two
-    poses agree whatever X is.
-
-    ``symmetries`` : all board_from_board except the identity. Returns poses and views as if all views had been numbered
-    alike, and (m,) the number, from 1, of the symmetry that each view was turned by; 0 where the view stayed. Raises
-    DegenerateError: fewer than three poses.
-    """
+    poses agree whatever X is. ``symmetries`` : all board_from_board except the identity. Returns poses and views as if
+    all views had been numbered alike, and (m,) the number, from 1, of the symmetry that each view was turned by; 0
+    where the view stayed. Raises DegenerateError: fewer than three poses."""
     loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
     as_numbered = loop.camera_from_board
     variants = [as_numbered @ turn for turn in every]

@@ -197,10 +197,8 @@ MOVE_GROUP = {"freehand_robot_movement": True, "move_group": "manipulator", "mov
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
-    """Returns the transforms that add the camera to a tree of frames, of the names of :func:`frame_names`.
-
-    Raises InputError: a name is invalid, or the names are not all different.
-    """
+    """Returns the transforms that add the camera to a tree of frames, of the names of :func:`frame_names`. Raises
+    InputError: a name is invalid, or the names are not all different."""
     mount, first, *below = frame_names(result.setup, parent, child, camera_frame)
     if not below:
         return [Static(mount, first, result.mount_from_camera)]
@@ -210,10 +208,8 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
     """Returns the names of the frames from the root; NAME_link has the child NAME_optical_frame. Empty names: flange or
-    base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`.
-
-    Raises InputError: a name has a control character, or occurs twice.
-    """
+    base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`. Raises InputError: a name has a control character, or occurs
+    twice."""
     link = child or CAMERA_LINK
     below = [child or CAMERA_FRAME] if camera_frame == "optical" else [link, f"{link.removesuffix('_link')}{OPTICAL}"]
     names = [parent or FRAMES[setup].mount, *below]

@@ -303,11 +303,9 @@ def validated(
     workers: int | None = 1,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Outcome:
-    """Returns the result of a method, or of the way that predicts best, with σ that hold for poses held out.
-
-    ``rows`` : (s, k) poses to hold out; ``prior`` : of intrinsics that may be solved for; ``choosing`` : among all
-    ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
-    """
+    """Returns the result of a method, or of the way that predicts best, with σ that hold for poses held out. ``rows`` :
+    (s, k) poses to hold out; ``prior`` : of intrinsics that may be solved for; ``choosing`` : among all ways. Raises
+    StcalError: as :func:`stcal.handeye.handeye`."""
     problem, notes, compared, held_out = problem_of(given, options), (), (), None
     if method == ALL:  # the result is that of the default method
         result = problem.solved().result

@@ -78,13 +78,10 @@ def estimate_offset(
     with_scale: bool = False,
 ) -> TimeOffset:
     """Estimates offset, X and Z by least squares of the loop's residuals, with σ estimated as by method ``pose``.
-
     ``pairs`` : only their poses of the board are used; ``seconds`` : (m,) times of the pairs after the stream's origin,
-    by the camera's clock; ``noise`` : known σ; ``with_scale`` : whether the board's size is an unknown.
-
-    Raises InputError: too few poses, or too few within the stream. Raises DegenerateError: the flange stands still at
-    the images, or its motions leave the offset open. Raises ConvergenceError: the offset does not converge.
-    """
+    by the camera's clock. Raises InputError: too few poses, or too few within the stream. Raises DegenerateError: the
+    flange stands still at the images, or its motions leave the offset open. Raises ConvergenceError: it does not
+    converge."""
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
         raise InputError("E-TIME-OFFSET-FEW", f"{pairs.where}: {len(pairs)} poses, {LEAST_POSES} needed for an offset")

@@ -84,13 +84,9 @@ class HeldOutPoses(Brief):
 
     def scatter(self, result: HandEye) -> float:
         """Returns how much solutions without some poses scatter about that of all, relative to its σ, RMS over splits
-        and six parameters: 1 is expected; NaN without covariance or solutions.
-
-        If k of m poses with independent errors are held out, the difference has the covariance C k / (m − k), where C
-        is that of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989); a little more if few
-        poses are left, as their information varies (the mean of an inverse Wishart matrix exceeds the inverse of the
-        mean). Errors that are correlated, or differ in size, make it larger.
-        """
+        and six parameters: 1 is expected; NaN without covariance or solutions. If k of m poses are held out, the
+        difference has the covariance C k / (m − k) (delete-k jackknife, Shao & Wu, Ann. Statist. 17, 1989), more with
+        few poses left. Correlated or unequal errors make it larger."""
         matrices, seen = self.mount_from_camera, result.observability
         if result.covariance is None or matrices is None or not len(self.rows):
             return float("nan")

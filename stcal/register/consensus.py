@@ -162,11 +162,9 @@ class Problem:
         return fitted.required("registration", "are the covariances true, or some of them huge?").state
 
     def unit_covariance(self, transform: Transform) -> np.ndarray:
-        """Returns the covariance (p, p) of a fit's parameters at unit noise.
-
-        Parameters of a left perturbation in frame b: rotation vector (rad), translation (mm), and of a similarity the
-        relative scale. Affine: rows of the 3×4 matrix.
-        """
+        """Returns the covariance (p, p) of a fit's parameters at unit noise. Parameters of a left perturbation in frame
+        b: rotation vector (rad), translation (mm), and of a similarity the relative scale. Affine: rows of the 3×4
+        matrix."""
         origin = self._middle()
         normal, motions, shift = self._normal(transform, origin), _motions(self.model, transform), np.eye(4)
         shift[:3, 3] = -origin
@@ -273,9 +271,7 @@ WIDE = 8.0  # threshold in σ beyond which nothing is cut off; the tail of χ²�
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
     """Returns σ per axis, mm, of ``count`` points whose residuals were cut off at a threshold, which may be infinite.
-
-    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance; below c = 1 they tell nothing of σ.
-    """
+    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance; below c = 1 they tell nothing of σ."""
     sigma = float(np.sqrt(square_sum / model.redundancy(count)))
     if sigma == 0 or threshold > WIDE * sigma:
         return sigma
@@ -432,10 +428,8 @@ class Fitted:
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
-    """Returns the transform with its inliers and σ; ``threshold`` : mm of a point of mean σ, estimated if None.
-
-    Raises DegenerateError: too few points agree. Raises ConvergenceError.
-    """
+    """Returns the transform with its inliers and σ; ``threshold`` : mm of a point of mean σ, estimated if None. Raises
+    DegenerateError: too few points agree. Raises ConvergenceError."""
     rng, count = np.random.default_rng(seed), len(problem)
     subset = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
     if threshold is None:

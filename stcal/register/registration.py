@@ -406,11 +406,9 @@ def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, t
 
 
 def covariance_of(inliers: Problem, b_from_a: Affine, sigma: float, threshold: float) -> tuple[np.ndarray, bool, float]:
-    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
-
-    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
-    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
-    """
+    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ. A given σ is
+    kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold`` in mm,
+    increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection."""
     redundancy, used, scaled = float(inliers.redundancy), sigma, True
     if inliers.sigma_mm is not None:
         scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)

@@ -49,11 +49,9 @@ def measured(
     covariance: np.ndarray | None = None,
     conditions: Conditions = USUAL,
 ) -> Measurements:
-    """Returns what an instrument measures of the robot at joint vectors (m, n).
-
-    The poses have normal noise of these σ per axis, or of ``covariance`` (m, 6, 6), which then comes with them. They
-    are of tool ``""``, or of each row's ``targets``, and under the rows' ``conditions``.
-    """
+    """Returns what an instrument measures of the robot at joint vectors (m, n). The poses have normal noise of these σ
+    per axis, or of ``covariance`` (m, 6, 6), which then comes with them. They are of tool ``""``, or of each row's
+    ``targets``, and under the rows' ``conditions``."""
     targets = tuple(targets) or ("",) * len(q)
     tip = State(robot.chain(), dict(robot.tools)).tips(q, targets, conditions)
     noise = rng.normal(0, 1, (len(q), 6))

@@ -94,11 +94,10 @@ def defocused(
     blur_px: float,  # σ of the Gaussian blur that follows, which decides how many points of the lens are taken
     light: np.ndarray | None = None,  # (h, w) of the disc on the last plane; even if None
 ) -> np.ndarray:
-    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens. Parallel
-    planes hold one outline each, and a ray is seen that lies in all of them. Through a point p of the lens each
-    plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z). On a plane 1/Z is linear in the image, with a
-    gradient g, so that the movement is an affine map: what is seen at y was at y − p (1/z_f − 1/Z(y)) / (1 − g p).
-    The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion."""
+    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens. Through a
+    point p of the lens each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z), an affine map, 1/Z being
+    linear in the image. The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle
+    of confusion."""
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)
     at_lens, weights = lens.points(widest, blur_px)
     base = np.array(corner_px) - 0.5 + 0.5 / cells  # pixel of the first square

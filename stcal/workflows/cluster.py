@@ -21,12 +21,9 @@ ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
 @contextlib.contextmanager
 def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     """Hand the work on single images to the Dask cluster at ``tcp://host:8786`` for the duration of the context.
-
     ``send_images`` : whether images are sent by content, and not by their path on storage that all workers share.
-
     Raises InputError: the extra ``dask`` is not installed, no scheduler or worker answers, or a worker has other
-    versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
-    """
+    versions. Raises DetectionError: the scheduler was lost, or an image ended several workers."""
     with connected(address) as client:
         from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker

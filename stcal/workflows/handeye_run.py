@@ -119,9 +119,7 @@ their order counts as that of a motion; and least number of such poses."""
 @one_thread()
 def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
     """Returns the input with the robot's poses at the estimated offset, and numberings of a symmetric board corrected.
-
-    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: as :func:`estimate_offset`.
-    """
+    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: as :func:`estimate_offset`."""
     timed = given.timed
     if timed is None:
         said = f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s"

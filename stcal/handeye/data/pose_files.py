@@ -129,10 +129,8 @@ _SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
 
 def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> PoseContent | None:
     """Returns the content of a file. Returns None for the package's own tables, and for tables whose readers give
-    better messages.
-
-    ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
-    """
+    better messages. ``key`` : the column that names rows, where there is one; ``quaternions`` as in
+    :func:`~stcal.io.table.read_table`."""
     if path.is_dir():
         raise InputError("E-POSES-NOT-FOUND", f"{path}: a folder; one file needed: {KNOWN}")
     try:
@@ -338,12 +336,9 @@ def read_two(
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
 ) -> HandEyeInput | None:
-    """Returns the robot's poses and the camera's, from two files, as pairs; None where both are the package's own
-    tables.
-
-    The rows are joined by image or time, or by their order where neither file has names. Where times are not equal,
-    and for all rows where ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``.
-    """
+    """Returns the robot's poses and the camera's, from two files, as pairs, joined by image or time, or by order where
+    neither has names; None where both are the package's own tables. Where times are not equal, and for all rows where
+    ``timed``, the robot's poses are those at the camera's times, within ``tolerance_s``."""
     files = tuple(zip(SIDES, (first, second), keys_of(key), strict=True))
     contents = [read_content(path, statements.of(role), own, quaternions) for role, path, own in files]
     if not any(contents):
@@ -394,12 +389,8 @@ TIME = "time_s"  # column of a stream of poses, in place of ``image``
 
 
 def read_robot(path: Path, statements: Said, quaternions: Order = "wxyz") -> PoseSide:
-    """Returns the robot's poses of a file. A table of the package's own has a column ``image``, or ``time_s``, and
-    ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
-
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``statements`` : the
-    user's statements about what a file of another program does not state itself.
-    """
+    """Returns the robot's poses of a file; a table of the package's own has a column ``image``, or ``time_s``, and
+    ``base_from_flange_x_mm`` … (or the inverse). ``statements`` : what the user says of another program's file."""
     content = read_content(path, statements.of("robot"), "image", quaternions)
     if content is not None:
         return settled(content, "robot", path, statements)

@@ -55,12 +55,9 @@ def trailing_number(name: str) -> int | None:
 
 
 def rows_of_images(robot: PoseSide, names: Sequence[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
-    """Returns the row by image, the images of rows without a partner, and how they were matched.
-
-    Names may lack folder and ending where that leaves one image. Where no name fits, images are matched by times or by
-    the numbers at the ends of names; poses without names, by order. The last result is empty where images are matched
-    by name.
-    """
+    """Returns the row by image, the images of rows without a partner, and how they were matched, empty if by name.
+    Names may lack folder and ending where that leaves one image; where none fits, times or the numbers at their ends
+    match, and poses without names by order."""
     where, places = f"robot poses {robot.where}", robot.places
     if not robot.names:
         if len(names) != len(robot):

@@ -23,15 +23,10 @@ SEED = 0  # seed of the subsets, so that they are the same every time
 
 
 def robust(loop: Loop, with_scale: bool = False) -> LoopState:
-    """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation.
-
-    The product needs no weight between the two units. Translations are in units of the board, since a board shrunk to
-    nothing would fit a flange that turns about a point. The solution is repeated with all poses within three times the
-    medians. Rotations are found by Shah (2013), then translations, and the board's scale where wanted, by linear least
-    squares. No logarithms are used, so that half turns are motions like any other.
-
-    Raises DegenerateError: fewer than three poses.
-    """
+    """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation,
+    which needs no weight between the two units; then of all poses within three times the medians. Rotations are found
+    by Shah (2013), then translations and scale by linear least squares, in units of the board: one shrunk to nothing
+    would fit a flange that turns about a point. Raises DegenerateError: fewer than three poses."""
     m = len(loop)
     if m < 3:
         raise DegenerateError("E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; turn the flange about two axes")
@@ -176,16 +171,11 @@ GAP = 1e-4  # largest relative excess of the largest error over the proven bound
 
 
 def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
-    """Returns X by Zhao's method, L∞ minimisation; ``unit_mm`` is the length that weighs like one radian.
-
-    Zhao, *Hand-eye calibration using convex optimization*, ICRA 2011, in the form of orthogonal matrices: minimise over
-    x = (vec R_X, b_X), with R_X any matrix, the largest ‖C_i x − d_i‖, the twelve equations of motion i; then take the
-    rotation nearest to R_X. This second-order cone program has 13 unknowns and one smooth constraint for each motion.
-    Sequential quadratic programming solves it in a few dozen steps, and the multipliers at the solution prove that it
-    is the minimum. A conic solver is not needed.
-
-    Raises ConvergenceError: the bound is not reached, or the matrix is not a rotation.
-    """
+    """Returns X by Zhao's L∞ minimisation (*Hand-eye calibration using convex optimization*, ICRA 2011), in the form of
+    orthogonal matrices: over x = (vec R_X, b_X), with R_X any matrix, the largest ‖C_i x − d_i‖, the twelve equations
+    of motion i; then the nearest rotation. Sequential quadratic programming solves this cone program of 13 unknowns,
+    and its multipliers prove the minimum. ``unit_mm`` : the length that weighs like one radian. Raises
+    ConvergenceError: the bound is not reached, or the matrix is not a rotation."""
     c, d = equations(motions, unit_mm)
     x = smallest_largest(c, d, np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)[0])
     u, s, vt = np.linalg.svd(x[:9].reshape(3, 3, order="F"))

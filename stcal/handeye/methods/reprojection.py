@@ -449,15 +449,11 @@ class AdjustedCorners:
 def adjust_views(
     loop: Loop, views: Views, first: LoopState, noise: Noise, intrinsics: CameraPrior | None, with_scale: bool
 ) -> AdjustedCorners:
-    """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
-
-    ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
-    their σ, the true poses of the robot and the true places of the board's corners. Intrinsics about ``intrinsics``
-    (whose σ are widened where the corners contradict them) and the board's scale are unknowns on demand. Corners and
-    poses have Huber's weights; poses that contradict the others are then left out.
-
-    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
-    """
+    """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale. ``loop`` holds the same poses as
+    ``views``. Unknowns are X, Z and, according to their σ, the true poses of the robot and places of the corners; on
+    demand intrinsics about ``intrinsics``, and the scale. Corners and poses have Huber's weights; poses that contradict
+    the others are then left out. Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than
+    three poses agree."""
     used, good = _near(loop, first), len(loop)
     while True:
         rows = np.flatnonzero(used)

@@ -52,11 +52,9 @@ class Arc:
 
 
 def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
-    """Returns the arcs of all joints, and notes on arcs that are not used. Rows of one reflector that differ in exactly
-    one *kinematic* joint value form an arc. Positions a full turn apart are one only for the joint that turns.
-
-    Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
-    """
+    """Returns the arcs of all joints, rows of one reflector that differ in exactly one *kinematic* joint value, and
+    notes on arcs not used. Positions a full turn apart are one only for the joint that turns. Raises InputError: no
+    positions, a joint that is never swept, or a reflector that does not move."""
     names, places = np.array(data.targets), data.points()
     for target in dict.fromkeys(data.targets):
         points = places[names == target]
@@ -456,11 +454,9 @@ ON_AXIS = (
 
 def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
     """Returns the axis of a joint by robust least squares of the distances of its arcs' points to circles or lines.
-
     ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
     this joint; ``where`` : the joint, for messages. Raises DegenerateError: no redundancy, reflectors on the axis, or
-    arcs too short to give a direction. Raises InputError: a motion that is not that of the joint's values.
-    """
+    arcs too short to give a direction. Raises InputError: a motion that is not that of the joint's values."""
     size = np.array([np.linalg.norm(p - p.mean(axis=0), axis=1).max() for p in (points[arc.rows] for arc in arcs)])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
         raise DegenerateError("E-AXES-UNDETERMINED", f"{where}: {ON_AXIS.format(size.max())}")
@@ -482,11 +478,9 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
 def fit_axes(
     data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
 ) -> tuple[list[AxisFit], np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the fits in order, their common covariance, the points with all joints unwound, and the derivatives
-    (P, P) of the parameters of all axes by those of each joint's own fit, which axes after it inherit by unwinding.
-
-    The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
-    """
+    """Returns the fits in order, their common covariance, the points with all joints unwound, and the derivatives (P,
+    P) of the parameters of all axes by those of each joint's own fit, which axes after it inherit by unwinding. The
+    covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors."""
     kinematic = data.q @ robot.coupling.T
     points, m, count = np.array(data.points()), len(data), int(np.where(robot.prismatic, 2, 4).sum())
     turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # rotation of the noise by unwinding

@@ -368,13 +368,9 @@ ROUNDS, SEARCHES = 6, 2
 
 def agreeing(problem: ArmProblem, state: State) -> np.ndarray:
     """Returns a mask (r,) of the observations that agree with a solution near ``state``, linear about it; all agree if
-    too few are redundant. Their σ need only be known up to a common factor.
-
-    Huber weights bound the pull of an observation, but in a set of few rows several wrong ones together bend the
-    solution until they fit. Least trimmed squares (Rousseeuw 1984) seeks the solution whose better half fits best, from
-    many small subsets by concentration steps (Rousseeuw & Van Driessen, Data Mining and Knowledge Discovery 12, 2006).
-    Rows that are unlikely by the solution of the agreeing rows, with its own uncertainty, are called errors.
-    """
+    too few are redundant. Their σ need only be known up to a common factor. Where few rows bend a solution with Huber's
+    weights, least trimmed squares (Rousseeuw 1984) seeks the one whose better half fits best, by concentration steps
+    (Rousseeuw & Van Driessen 2006); rows unlikely by it are errors."""
     measured, weighting = problem.measured, problem.weighting
     good = every = np.ones(len(measured), bool)
     for step in range(ROUNDS):

@@ -56,16 +56,9 @@ def left(
     weights: np.ndarray | None = None,
 ) -> tuple[Effect, ...] | None:
     """Returns the effects found in the residuals of ``state``, at most three, the strongest first; None for too few
-    rows.
-
-    Candidates of a revolute joint are its zero, its angle once and twice a turn (its gear, or a motion along the base's
-    axes), its approach, the torque of a load; of each joint the values of the others (a coupling). Candidates of place
-    are scale, linear terms, and the distance from the base's axis. Along the order of the rows, a jump or drift of
-    instrument, base, target or a joint's zero is tried with all rows, since half of them may seem to be errors.
-
+    rows. Along the order of the rows, a jump or drift is tried with all rows, since half of them may seem to be errors.
     ``explained`` : (r, w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are
-    left out.
-    """
+    left out."""
     explained = state.jacobian(measured) if explained is None else explained
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
     errors, white = state.residuals(measured), partial(weighting.whiten, measured=measured)

@@ -32,10 +32,8 @@ ROUNDING, ROUNDING_MM, NOTHING_MM, NOTHING_RAD = 1e-12, 1e-9, 1e-12, 1e-14
 
 def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
     """Returns the robot whose rows, base and tools give the same poses as ``chain`` with ``tools`` (flange_from_tool).
-
     What a chain does not determine is kept from ``nominal``: θ and d of the first row, the part of the last row after
-    its joint, a and d of a prismatic joint, and d of a row with β.
-    """
+    its joint, a and d of a prismatic joint, and d of a row with β."""
     n = len(chain)
     rows = list(nominal.rows)
     standard = nominal.convention == "standard"
@@ -182,12 +180,10 @@ FITS, TURNED_RAD = 0.05, 0.2
 def require_orientations(
     where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray, many: bool = True
 ) -> None:
-    """Refuses orientations of which most are not those of the robot, whatever its tools, by InputError.
-
-    ``where`` : name of the file; ``targets`` : (m,) of the rows; ``flange``, ``seen`` : (m, 3, 3) rotations by the
-    model, and of the targets as read; ``many`` : False for few rows, which are refused only if quaternions of another
-    convention fit. One orientation in all rows is no misreading.
-    """
+    """Refuses orientations of which most are not those of the robot, whatever its tools, by InputError. ``where`` :
+    name of the file; ``targets`` : (m,) of the rows; ``flange``, ``seen`` : (m, 3, 3) rotations by the model, and of
+    the targets as read; ``many`` : False for few rows, which are refused only if quaternions of another convention fit.
+    One orientation in all rows is no misreading."""
     own = _typical_rad(targets, flange, seen)
     if own < TURNED_RAD or np.ptp(seen, axis=0).max() < NOTHING_RAD:
         return

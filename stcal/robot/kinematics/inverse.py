@@ -304,11 +304,9 @@ class InverseProblem:
         return turned, ((turned >= low - LIMIT_SLACK) & (turned <= high + LIMIT_SLACK)).all(axis=1)
 
     def _is_nearest(self, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``.
-
-        A solution is the only one within 2σ/K, σ the smallest singular value of the Jacobian there and K its Lipschitz
-        constant (Newton–Kantorovich), which in the embedding of :meth:`_embedded` is at most √2 n ‖coupling‖².
-        """
+        """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``. A solution is
+        the only one within 2σ/K, σ the smallest singular value of the Jacobian there and K its Lipschitz constant
+        (Newton–Kantorovich), which in the embedding of :meth:`_embedded` is at most √2 n ‖coupling‖²."""
         bound = np.sqrt(2) * q.shape[1] * np.linalg.norm(self.robot.coupling, 2) ** 2
         return np.linalg.norm(q - near, axis=1) <= self._weakest(q) / bound
 

@@ -333,10 +333,8 @@ _KNOWN = re.compile(
 
 def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, tuple[str, ...], tuple[str, ...]]:
     """Returns m poses (None without orientations), the columns of their angles, and a note that names the convention.
-
     ``rotation`` : convention of angles whose columns do not state it, as for ``--rotation``. Raises InputError: columns
-    of a rotation are incomplete, or the convention is missing, or given without such columns or beside their own.
-    """
+    of a rotation are incomplete, or the convention is missing, or given without such columns or beside their own."""
     from stcal.io.rotations import read_rotations
 
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)

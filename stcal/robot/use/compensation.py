@@ -77,11 +77,9 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 
 
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
-    """Returns whether joint values beside the poses confirm them, and doubts about the poses of ``robot``.
-
-    Raises InputError: joint values lead to the poses in another unit, convention or order of rows, which it names;
-    chance does so once in 10⁶ a row.
-    """
+    """Returns whether joint values beside the poses confirm them, and doubts about the poses of ``robot``. Raises
+    InputError: joint values lead to the poses in another unit, convention or order of rows, which it names; chance does
+    so once in 10⁶ a row."""
     poses, q = targets.poses, targets.q
     if poses is None:
         return True, ()

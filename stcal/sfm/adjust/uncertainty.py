@@ -211,14 +211,10 @@ def centre_sigma_px(state: Adjusted, kind: str) -> float:
 
 
 def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Adjusted:
-    """Returns an adjustment that knows by how much its photographs differ more than their pixels explain, pooled over
-    all faces and groups; arguments as of :func:`calibrated_target`.
-
-    Few photographs show a face, so that a covariance by photographs is itself uncertain. One factor for all of them is
-    not: the mean over the faces of how far the photographs' pulls on a face scatter, over what independent errors of
-    pixels would do. A photograph's own residuals are smaller than its errors, as it took part in the answer; they are
-    corrected for that (CR2, Bell & McCaffrey 2002).
-    """
+    """Returns an adjustment that knows by how much its photographs differ more than their pixels explain; arguments as
+    of :func:`calibrated_target`. One factor pools all faces and groups: how far the photographs' pulls on a face
+    scatter over what independent errors of pixels would do, as few photographs show a face. A photograph's residuals
+    are corrected for its part in the answer (CR2, Bell & McCaffrey 2002)."""
     result = state.result()
     by_circles = [own for own in derivatives(result, start, target, kind).faces.values() if own.any()]
     if not by_circles:

@@ -130,12 +130,9 @@ class TriedModel:
 def held_out(
     result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign, folds: int = FOLDS
 ) -> HeldOut | None:
-    """Returns the residuals of all ``views`` of a ``result``, each held out once; None with too few views.
-
-    The places of the dots are those estimated from the other views of the folder, or design places if there are none.
-
-    Raises StcalError: a calibration without some of the views fails.
-    """
+    """Returns the residuals of all ``views`` of a ``result``, each held out once; None with too few views. The places
+    of the dots are those estimated from the other views of the folder, or design places if there are none. Raises
+    StcalError: a calibration without some of the views fails."""
     folds = min(folds, len(views))
     if len(views) - -(-len(views) // folds) < MIN_TRAINING:
         return None

@@ -73,12 +73,9 @@ FEW = 3  # number of images up to which what was left out in each is said
 
 @contextlib.contextmanager
 def overlays_beside(seen: DetectedImages, task: Task, page: bool = True) -> Iterator[dict[str, frozenset[Label]]]:
-    """Writes ``detections.csv``, and draws the detections into every image while other work goes on.
-
-    All overlays exist at the end of the block, which adds to the yielded labels, by image, those that are to be crossed
-    out. Where the block fails, a page on why and what was found is written, and the error gets what most images have in
-    common; not without ``page``.
-    """
+    """Writes ``detections.csv``, and draws the detections into every image while other work goes on; all overlays exist
+    at the end of the block, which adds the labels to cross out to those yielded, by image. Where it fails, a page on
+    why and what was found is written, if ``page``, and the error gets what most images have in common."""
     stage, focal_px, face_ids = task.folder.stage, seen.detection.camera.focal, [face.id for face in task.target.faces]
     files.save(stage / "detections.csv", detections_csv(seen.observations))
     pictures = {image.file.name: image for image in seen.detection.images}
