@@ -289,7 +289,8 @@ class AxisFit:
             by_residual = np.concatenate([np.zeros((change.size, 0)), *step[at]], axis=1)
             kept = np.eye(by_residual.shape[1]) + jacobian[at].reshape(-1, change.size) @ by_residual
             kept -= np.diag(np.repeat((self.weights / sums)[at], 2))
-            change[:] = -by_residual @ np.linalg.solve(kept, self.residuals[at].ravel())
+            # singular where an arc rests on these points alone, which then say nothing of the axis
+            change[:] = -by_residual @ np.linalg.lstsq(kept, self.residuals[at].ravel(), rcond=1e-9)[0]
         return changes
 
     def unwound(self, points: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -474,7 +475,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
         return AxisFit(where, prismatic, used, rows, points[rows], member, largest, np.ones(len(rows)), start)
 
     fit = of(np.ones(len(arcs), bool), Rigid()).solved(moved)
-    near = np.array(fit.radii) <= NEAR_AXIS * fit.sigma_mm
+    near = (np.array(fit.radii) <= NEAR_AXIS * fit.sigma_mm) & (fit.member.T @ fit.weights > 0)
     if near.any():
         fit = of(~near, fit.world_from_axis).solved(None)
     return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(near)))

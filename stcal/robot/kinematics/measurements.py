@@ -381,6 +381,10 @@ class Targets(JointTable):
 
     def __post_init__(self):
         require_fields(self, "targets")
+        for what, given in (("tools", self.tools), ("poses", self.poses)):
+            if given is not None and len(given) != len(self):
+                fault = f"{self.where}: {len(given)} {what} for {len(self)} lines"
+                raise InputError("E-NAMES-COUNT", f"{fault}; one each needed")
         if self.q is not None:
             freeze(self, "q", (len(self), None), "joint values")
 

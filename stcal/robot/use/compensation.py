@@ -258,7 +258,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     Parameters
     ----------
     identified : as it is; mm, rad.
-    targets : m commanded poses base_from_tool; of files from :func:`read_targets`.
+    targets : m commanded poses base_from_tool; of files from :func:`read_targets`; in memory, with tools or joint
+        values, ``Targets("targets", range(1, m + 1), tools, poses, q)``.
     nominal : the model in its controller.
 
     Returns
