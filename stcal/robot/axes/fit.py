@@ -220,8 +220,9 @@ class AxisFit:
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Returns the weighted means (a, c) of values (k, c) by arc."""
-        weighted = self.member * self.weights[:, None]
-        return (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
+        none = self.member @ (self.weights @ self.member) == 0  # of arcs without weights, the plain mean
+        weighted = self.member * np.where(none, 1.0, self.weights)[:, None]
+        return (weighted.T @ values) / weighted.sum(axis=0)[:, None]
 
     def demean(self, values: np.ndarray) -> np.ndarray:
         """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""

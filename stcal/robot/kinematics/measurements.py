@@ -326,7 +326,7 @@ _UNITS = "|".join((*ANGLES, *LENGTHS))
 _KNOWN = re.compile(
     rf"q\d+_({_UNITS})|([xyz]|distance)_({'|'.join(LENGTHS)})|{'|'.join((*POSE[3:], *COVARIANCE))}|{COMMON.pattern}|"
     "target|status|from_row|pose|image|name|scene|set|line|station|faces|circles|rms_px|chi2_per_dof|error_mm|"
-    "error_deg|(commanded|nominal)_.*"
+    "error_deg|sigma_mm|(commanded|nominal)_.*"
 )
 """Columns that robot commands and ``stcal-sfm measure`` write. No command reports them as unread."""
 
