@@ -500,8 +500,8 @@ def load_universal(
     except (yaml.YAMLError, ValueError, RecursionError):
         content = None
     if not isinstance(content, dict) or "kinematics" not in content:
-        fault = f"{where}: no calibration of Universal Robots, and its name ends neither in .toml nor in .urdf"
-        raise InputError("E-ROBOT-FORM", f"{fault}; ur_calibration's YAML needed, or its calibration.conf")
+        needed = "ur_calibration's YAML or its calibration.conf needed; robot files end in .toml, URDF in .urdf or .xml"
+        raise InputError("E-ROBOT-FORM", f"{where}: no calibration of Universal Robots; {needed}")
     if nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
     return _of_kinematics(content, str(path), convention)

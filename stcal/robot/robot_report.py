@@ -82,7 +82,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
         *(f"D-H value of joints {p.joint}–{p.joint + 1} refused: {p.refused}" for p in result.pairs if p.refused),
         Table(pair_heads, pairs, [("", 3), ("robust", 3), ("common normal", 5), ("", 1)]),
         f"spread: largest less smallest value when each of {len(result.without_one.lines)} rows (with its reflectors) "
-        "is left out",
+        "is left out (to first order)",
         page_only(
             "Distance: of nearly parallel axes in the plane across the first that its row in the robot has (Hayati), "
             "of others along their common normal. Foot: of the common normal, along the first axis from where that was "

@@ -159,7 +159,7 @@ def _steps(result: FromPhotos) -> dict[str, tuple]:
     page = partial(identified_report, identified)
     steps["identified"] = "toml", text, again, IdentifiedFile.model_validate(identified), page
     if compensated is not None:
-        text = arms.compensated_csv(compensated, identified.robot)
+        text = arms.compensated_csv(compensated, identified.robot, result.sigma_mm())
         content = CompensationFile.model_validate(compensated)
         again, page = partial(require_text_written, text=text), partial(compensation_report, compensated)
         steps["compensated"] = "csv", text, again, content, page

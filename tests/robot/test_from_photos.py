@@ -118,6 +118,7 @@ def test_each_model_errs_less_than_the_one_before_and_its_files_are_read_by_the_
     sent = read_table(tmp_path / "arm/compensated.csv", "joint values")
     q = np.column_stack([sent.quantity(f"q{i}", {"deg": np.pi / 180}) for i in range(1, 7)])
     np.testing.assert_allclose(q, swept.compensated.found.q, atol=1e-10)  # nine decimals of a degree
+    np.testing.assert_allclose(sent.numbers("sigma_mm"), sigma, atol=1e-6)
 
 
 @pytest.mark.full

@@ -74,7 +74,8 @@ class Pair:
 
 
 class LeaveOneOut(Part):
-    """The values of each pair without one row of the sweeps; :class:`AxesFile` describes the fields."""
+    """The values of each pair without one of r rows of the sweeps, to first order; :class:`AxesFile` describes the
+    fields. ``distance``, ``normal`` : r rows of n − 1, mm, None where there is none."""
 
     lines: list[int]
     distance: Rows
@@ -319,11 +320,23 @@ def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.ndarray
     return np.concatenate([cosines, moments, np.linalg.det(z[three])])
 
 
+def _apart(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> float:
+    """Returns the sum of the distances of revolute axes; of two nearly parallel ones, the distance across them."""
+    total = 0.0
+    for i, k in combinations(np.flatnonzero(~sliding), 2):
+        between, normal = origin[k] - origin[i], np.cross(z[i], z[k])
+        sine = np.linalg.norm(normal)
+        parallel = sine < np.sin(AGREES_RAD)
+        total += np.linalg.norm(np.cross(between, z[i])) if parallel else abs(between @ normal) / sine
+    return float(total)
+
+
 def _require_signs(where: str, frames: list[Rigid], nominal: Robot) -> None:
-    """Refuses mirrored positions, and joints with reversed sign."""
+    """Refuses mirrored positions, joints with reversed sign, and an arm of another size."""
     n, sliding = len(frames), nominal.prismatic
     rotation, origins = joint_frames(nominal.chain(), np.zeros((1, n)))
-    shape = _shape(rotation[:, 0, :, 2], origins[:, 0], sliding)
+    drawn = rotation[:, 0, :, 2], origins[:, 0], sliding
+    shape = _shape(*drawn)
     directions, places = np.array([f.rotation[:, 2] for f in frames]), np.array([f.translation for f in frames])
 
     def off(sign: np.ndarray, mirror: float = 1.0) -> float:
@@ -345,21 +358,20 @@ def _require_signs(where: str, frames: list[Rigid], nominal: Robot) -> None:
     if reversed_[best] < as_it_is / 2:
         fault = f"{where}: joint {named} counts against {robot}'s"
         raise InputError("E-AXES-SIGN", f"{fault}; correct alpha in the robot file or the sign of its values")
+    apart, right = _apart(directions, places, sliding), _apart(*drawn)
+    if right > 0 and not 1 / LIKE_SIZE < apart / right < LIKE_SIZE:
+        fault = f"{where}: the axes lie {apart / right:.3g} times as far apart as {robot}'s"
+        raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
 
 
 def _require_build(where: str, robot: Robot, nominal: Robot) -> None:
-    """Refuses an arm of other angles between its axes, or of other lengths, than the nominal one."""
+    """Refuses an arm of other angles between its axes than the nominal one."""
     for i, (row, drawn) in enumerate(zip(robot.rows, nominal.rows, strict=True), 1):
         if abs(row.alpha - drawn.alpha) > AGREES_RAD:
             alpha, nominal_alpha = np.degrees([row.alpha, drawn.alpha])
             fault = f"{where}: alpha of row {i} is {alpha:.1f}°, {nominal_alpha:.1f}° in robot {nominal.name}"
             remedy = "correct its alpha or theta, or the sign with which a joint counts"
             raise InputError("E-AXES-ANGLE", f"{fault}; {remedy}")
-    # of all rows but d of the first and the last, which the axes do not tell
-    found, drawn = (sum(abs(r.a) for r in b.rows) + sum(abs(r.d) for r in b.rows[1:-1]) for b in (robot, nominal))
-    if drawn > 0 and not 1 / LIKE_SIZE < found / drawn < LIKE_SIZE:
-        fault = f"{where}: the axes lie {found / drawn:.3g} times as far apart as robot {nominal.name}'s"
-        raise InputError("E-AXES-UNITS", f"{fault}; check the unit of x, y, z, and the lengths in the robot file")
 
 
 def _remarks(

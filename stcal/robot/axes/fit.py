@@ -218,8 +218,9 @@ class AxisFit:
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Returns the weighted means (a, c) of values (k, c) by arc."""
-        weighted = self.member * self.weights[:, None]
-        return (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
+        none = self.member @ (self.weights @ self.member) == 0  # of arcs without weights, the plain mean
+        weighted = self.member * np.where(none, 1.0, self.weights)[:, None]
+        return (weighted.T @ values) / weighted.sum(axis=0)[:, None]
 
     def demean(self, values: np.ndarray) -> np.ndarray:
         """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
@@ -287,7 +288,8 @@ class AxisFit:
             by_residual = np.concatenate([np.zeros((change.size, 0)), *step[at]], axis=1)
             kept = np.eye(by_residual.shape[1]) + jacobian[at].reshape(-1, change.size) @ by_residual
             kept -= np.diag(np.repeat((self.weights / sums)[at], 2))
-            change[:] = -by_residual @ np.linalg.solve(kept, self.residuals[at].ravel())
+            # singular where an arc rests on these points alone, which then say nothing of the axis
+            change[:] = -by_residual @ np.linalg.lstsq(kept, self.residuals[at].ravel(), rcond=1e-9)[0]
         return changes
 
     def unwound(self, points: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -469,7 +471,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
         return AxisFit(where, prismatic, used, rows, points[rows], member, largest, np.ones(len(rows)), start)
 
     fit = of(np.ones(len(arcs), bool), Rigid()).solved(moved)
-    near = np.array(fit.radii) <= NEAR_AXIS * fit.sigma_mm
+    near = (np.array(fit.radii) <= NEAR_AXIS * fit.sigma_mm) & (fit.member.T @ fit.weights > 0)
     if near.any():
         fit = of(~near, fit.world_from_axis).solved(None)
     return replace(fit.oriented(moved), near=tuple(arcs[i] for i in np.flatnonzero(near)))

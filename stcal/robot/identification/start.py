@@ -265,12 +265,15 @@ def _of_values(robot: Robot, data: Measurements) -> Iterator[Case]:
         remedy = f"check its direction in the rows, or the sign of q{i + 1}"
         reversed_ = replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
         yield f"joint {i + 1} had the opposite sign; {remedy}", robot, reversed_
-    makers = {0.0: "", 1.0: ", as Fanuc's are", -1.0: ", as those of parallel linkages are"}
+    if (robot.coupling != np.eye(n)).any():
+        what = "the joints were not coupled; take coupling out of the robot file"
+        yield what, replace(robot, coupling=np.eye(n)), data
+    makers = {1.0: "as Fanuc's are", -1.0: "as those of parallel linkages are"}
     for sign, whose in makers.items() if n >= 3 else ():
-        coupling = np.eye(n)
+        coupling = robot.coupling.copy()
         coupling[2, 1] = sign
         if (coupling != robot.coupling).any():
-            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}{whose}; give coupling in the robot file so"
+            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {whose}; give coupling in the robot file so"
             yield what, replace(robot, coupling=coupling), data
 
 

@@ -77,6 +77,7 @@ def left(
         found = min(tried, key=lambda each: each.log_p)
         findings.append(found.finding)
         explained, root = np.concatenate([explained, found.motions], axis=2), found.root
+        square = 0.0 if found is in_order else square  # shares are of what is left beside a jump, which may hide all
     return tuple(findings)
 
 

@@ -326,7 +326,7 @@ _UNITS = "|".join((*ANGLES, *LENGTHS))
 _KNOWN = re.compile(
     rf"q\d+_({_UNITS})|([xyz]|distance)_({'|'.join(LENGTHS)})|{'|'.join((*POSE[3:], *COVARIANCE))}|{COMMON.pattern}|"
     "target|status|from_row|pose|image|name|scene|set|line|station|faces|circles|rms_px|chi2_per_dof|error_mm|"
-    "error_deg|(commanded|nominal)_.*"
+    "error_deg|sigma_mm|(commanded|nominal)_.*"
 )
 """Columns that robot commands and ``stcal-sfm measure`` write. No command reports them as unread."""
 
@@ -379,6 +379,10 @@ class Targets(JointTable):
 
     def __post_init__(self):
         require_fields(self, "targets")
+        for what, given in (("tools", self.tools), ("poses", self.poses)):
+            if given is not None and len(given) != len(self):
+                fault = f"{self.where}: {len(given)} {what} for {len(self)} lines"
+                raise InputError("E-NAMES-COUNT", f"{fault}; one each needed")
         if self.q is not None:
             freeze(self, "q", (len(self), None), "joint values")
 

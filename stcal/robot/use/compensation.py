@@ -256,7 +256,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     Parameters
     ----------
     identified : as it is; mm, rad.
-    targets : m commanded poses base_from_tool; of files from :func:`read_targets`.
+    targets : m commanded poses base_from_tool; of files from :func:`read_targets`; in memory, with tools or joint
+        values, ``Targets("targets", range(1, m + 1), tools, poses, q)``.
     nominal : the model in its controller.
 
     Returns
@@ -385,16 +386,17 @@ def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
 
 
 @require_arguments
-def compensated_csv(result: Compensated, robot: Robot) -> str:
+def compensated_csv(result: Compensated, robot: Robot, sigma_mm: Sequence[float] | np.ndarray = ()) -> str:
     """Returns the CSV of the joint values of ``result`` for its ``robot``, empty where a pose is not reached.
 
-    Joint values in degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    Joint values in degrees or mm, what errors they leave, mm and degrees (form: ``data_layout.md``), and ``sigma_mm`` :
+    predicted σ of the tool's position there, if known; nan if not reached, an empty cell.
     """
     columns, names = joint_columns(robot), result.targets.names
     head = [*names, "line", "target", *columns, "status", "error_mm", "error_deg"]
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
-    rows: list[Sequence] = [head]
+    rows: list[Sequence] = [[*head, "sigma_mm"] if len(sigma_mm) else head]
 
     def cells(inverse: Inverse, i: int, mm: np.ndarray, rad: np.ndarray, shown: bool = True) -> list[str]:
         values = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
@@ -406,7 +408,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
         row += cells(result.found, i, result.found.error_mm, result.found.error_rad)
         if (nominal := result.nominal) is not None:
             row += cells(nominal, i, result.before_mm, result.before_rad, bool(nominal.usable[i]))
-        rows.append(row)
+        rows.append(row + ["" if np.isnan(sigma) else f"{sigma:.6f}" for sigma in sigma_mm[i : i + 1]])
     return csv_text(rows)
 
 

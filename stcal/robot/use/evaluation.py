@@ -45,11 +45,12 @@ MISSES, MISSES_MM = 0.05, 20.0
 """Largest RMS deviation of measured from commanded distances, as a share and in mm; arms err by under 1 %."""
 OFF, OFF_MM, LEAST_POSES = 6.0, 0.1, 6
 """Ratio of a pose's typical error to that of most, and its size, from which on the pose is named; and least number of
-poses for it."""
+poses for it; of fewer, an error of MISSES_MM is named."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as elsewhere, and number up to which all are compared."""
 NO_BETTER = 0.8  # ratio to the errors of the first set from which on they are about as large
 MOST_OF_IT = 0.75  # share of the squared errors of distances from which on their scale is named
+SCALE_WITHIN = 0.005  # relative difference of scale from which on it is named in any case
 LEAST_SPREAD_MM = 20.0  # largest commanded distance below which the unit is doubted
 NOT_COMPENSATED = (
     "is the first set in the file the one before compensation, and were the others commanded with compensated joint "
@@ -92,14 +93,16 @@ class SetResult(Part):
     def doubt(self) -> str:
         """Returns why the measured positions may not belong to the commands; empty if they may."""
         allowed, said = max(MISSES * self.pairs_mm, MISSES_MM), self.elsewhere
-        by_scale = (self.scale - 1) * self.pairs_mm
+        by_scale, remedy = (self.scale - 1) * self.pairs_mm, "check units, and the instrument's scale"
+        times = f"measured distances are {self.scale:.6g} times the commanded ones"
         if not said and by_scale**2 > MOST_OF_IT * self.pairs_rms_mm**2 > MOST_OF_IT * OFF_MM**2:
-            times = f"measured distances are {self.scale:.6g} times the commanded ones, which is most of their error"
-            said = f"{times}: check units, and the instrument's scale"
+            said = f"{times}, which is most of their error: {remedy}"
         elif not said and self.pairs_rms_mm > allowed:
             missed = f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs)"
             remedy = "check the order of the poses, units, and the robot that commanded them"
             said = f"{missed}, {allowed:.3g} mm allowed; {remedy}"
+        elif not said and abs(self.scale - 1) > SCALE_WITHIN:
+            said = f"{times}, {1 - SCALE_WITHIN:g} to {1 + SCALE_WITHIN:g} allowed: {remedy}"
         return said and f"set {self.name}: {said}"
 
     def figures(self) -> dict[str, float]:
@@ -139,12 +142,13 @@ def _warnings(sets: list[SetResult], missing: dict[str, list[str]], most_mm: flo
     if most_mm < LEAST_SPREAD_MM:
         remedy = "if lengths are in another unit than the names of their columns say, correct these"
         found.append(f"commanded positions lie within {most_mm:.3g} mm of the first one; {remedy}")
-    first = sets[0]
+    first, before = sets[0], sets[0].pairs_rms_mm
     found += [
-        f"set {each.name}: errs by {each.pairs_rms_mm:.3g} mm (RMS of all pairs), no less than set {first.name} with "
-        f"{first.pairs_rms_mm:.3g} mm: {NOT_COMPENSATED}"
+        f"set {each.name}: errs by {each.pairs_rms_mm:.3g} mm (RMS of all pairs), "
+        f"{'no' if each.pairs_rms_mm >= before else 'hardly'} less than set {first.name} with {before:.3g} mm: "
+        f"{NOT_COMPENSATED}"
         for each in sets[1:]
-        if not each.doubt() and each.pairs_rms_mm > NO_BETTER * max(first.pairs_rms_mm, 1e-12)
+        if not each.elsewhere and each.pairs_rms_mm > NO_BETTER * max(before, 1e-12)
     ]
     return found
 
@@ -230,8 +234,8 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
         return "measured positions are the commanded ones to the last digit; give those of the instrument"
     wanted, found = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, measured))
     typical = np.median(np.abs(found - wanted), axis=1)
-    far = typical > max(OFF * np.median(typical), OFF_MM)
-    if len(names) < LEAST_POSES or not 0 < far.mean() <= MOST_ELSEWHERE:
+    far = typical > max(OFF * np.median(typical), OFF_MM if len(names) >= LEAST_POSES else MISSES_MM)
+    if not 0 < far.mean() <= MOST_ELSEWHERE:
         return ""
     listed = few([f"{names[i]} ({typical[i]:.2g} mm)" for i in np.flatnonzero(far).tolist()])
     others = f"far worse than the others, {np.median(typical):.2g} mm (median)"

@@ -12,7 +12,7 @@ from stcal.robot.axes.fit import find_arcs, fit_axes, length_of, ring
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.robot_file import load_robot
-from stcal.robot.kinematics.robot_model import Robot, mh80
+from stcal.robot.kinematics.robot_model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses
@@ -190,6 +190,17 @@ def test_a_gross_error_is_named_and_left_out(off_mm):
         assert abs(one.distance_mm - two.distance_mm) < 3 * two.distance_sigma_mm  # one of 18 points less
 
 
+@pytest.mark.parametrize("seed", [0, *sampled((1, 2), kept=())])
+def test_a_loose_reflector_is_left_out_row_by_row(seed, swept):
+    """Of an arc one point is left, or none."""
+    loose, positions = np.array(swept.targets) == "C", np.array(swept.positions)
+    positions[loose] += np.random.default_rng(seed).normal(0, 2.0, (loose.sum(), 3))
+    result = robot_from_sweeps(replace(swept, positions=positions), mh80())
+    assert [len(off) >= SWEEP - 1 for off in result.off] == [True] * 6
+    assert all(max(off.values()) < 10 for off in result.off)  # 5 σ
+    assert not any("close to the axis" in note for note in result.notes)
+
+
 def test_a_reflector_on_the_axis_says_nothing_and_a_row_without_a_target_is_named(swept):
     nominal = mh80()
     true = replace(arm(nominal), tools=TOOLS | {"D": Rigid(np.eye(3), [0.01, 0, 300])})
@@ -235,6 +246,10 @@ def test_the_arms_that_cannot_be_had(swept):
     good = measured(true, q, SIGMA)
     slides = measured(arm(scara()), sweep_values(scara()), SIGMA)
     robot_from_sweeps(slides, scara())
+    two = Robot("2R", "standard", (DHRow(300, 0, 0, 0),) * 2, (Joint(),) * 2)
+    planar = measured(placed(two, WORLD, TOOLS), sweep_values(two), SIGMA)
+    rows = (nominal.rows[0], replace(nominal.rows[1], beta=np.radians(3)), *nominal.rows[2:])
+    robot_from_sweeps(measured(placed(replace(nominal, rows=rows), WORLD, TOOLS), q, SIGMA), nominal)
     fixed, still = np.array(good.positions), np.array(swept.positions)
     fixed[1::3] = fixed[1]
     still[rows_of(3)] = np.tile(still[:3], (SWEEP, 1)) + np.random.default_rng(0).normal(0, SIGMA, (3 * SWEEP, 3))
@@ -249,6 +264,7 @@ def test_the_arms_that_cannot_be_had(swept):
         ("E-AXES-MIRRORED … scara", replace(slides, positions=slides.positions[:, [1, 0, 2]]), scara()),
         ("E-ROBOT-TREE", good, two_arms()),
         ("E-AXES-SIGN … 3 … MH80", replace(good, q=good.q * [1, 1, -1, 1, 1, 1]), nominal),
+        ("E-AXES-UNITS … 0.1 times … 2R", replace(planar, positions=planar.positions / 10), two),
         ("E-MEASURED-DISTANCES", replace(good, positions=None), nominal),
         ("E-AXES-UNDETERMINED … sweep further", measured(true, short, SIGMA), nominal),
         ("E-AXES-FEW … joint 1: 3 … 1", few, nominal),

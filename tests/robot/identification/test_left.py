@@ -109,6 +109,12 @@ def test_the_effect_is_what_was_put_in_and_neither_rounding_nor_too_few_rows_tel
     assert left_of(*simulated(9, 12), "position") is None
 
 
+def test_a_jump_hides_no_gear():
+    true, data = bent(7, 80, {2: lambda q, _: 3e-4 * np.sin(q[:, 1])})
+    jump, gear, *_ = left_of(true, moved_from(50, data, Rigid.exp([0, 0, 0, 20.0, 0, 0])), "position")
+    assert (jump.line, gear.joint, gear.turns) == (data.lines[50], 2, 1)
+
+
 JUMP = Rigid.exp([0, 0, 2e-3, 0.6, -0.8, 0])
 """Of the instrument: a millimetre, and a tenth of a degree."""
 
@@ -347,6 +353,7 @@ def as_it_is(q: np.ndarray) -> np.ndarray:
                 (mh80(), lambda q: np.roll(q, 1, axis=0), [], "one row further up"),
                 (mh80(), lambda q: np.roll(q, -1, axis=0), [], "one row further down"),
                 (mh80(), lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], [], "joint 3 were coupled to joint 2 by +1"),
+                (replace(mh80(), coupling=np.eye(6) + 0.5 * np.eye(6, k=-4)), as_it_is, [], "take coupling out"),
             ],
             kept=(1, 2, 3, 4),
         ),

@@ -187,6 +187,8 @@ def test_bad_targets_are_named_and_each_row_is_compensated_for_its_payload(case)
     refuses("E-TARGETS-NO-POSES … x_mm", case.read, ["a", "b"], [["1", "2"]])
     refuses("E-TARGETS-NO-ORIENTATION", case.read, POSE[:3], [["1", "2", "3"]])
     refuses("E-TARGETS-NO-POSES … --nominal", compensate, case.real, targets(None, case.q))
+    for poses, tools in ((case.poses, ("",)), (case.poses[:1], ("",) * 2)):
+        refuses("E-NAMES-COUNT … t.csv: 1", Targets, "t.csv", range(2), tools, poses, None)
     shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
     refuses("E-ROBOT-MISMATCH", compensate, case.real, targets(case.poses), shorter)
     for cell, option, message in (("-2", None, "E-PAYLOAD-VALUE … 2 … -2"), ("2", 3.0, "E-OPTION-CONFLICT … 3")):

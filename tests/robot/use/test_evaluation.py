@@ -292,6 +292,8 @@ def test_too_few_poses_other_units_and_wrong_poses_are_named(tmp_path):
     wrong = ten_poses(lambda at: at + far)
     assert wrong.startswith("set after: pose P5 (")
     assert ten_poses(lambda at: at + little).startswith("set after: pose P1 (")
+    few = verified(COMMANDED * 10, a=COMMANDED * 10 + [[0, 0, 0], [0, 0, 0], [200, 0, 0], [0, 0, 0], [0, 0, 0.1]])
+    assert few.warnings[0].startswith("set a: pose P3 (")
     late = ten_poses(lambda at: np.roll(at, 1, axis=0))
     assert "check the order of the poses" in late
     assert "check units" in ten_poses(lambda at: 1.1 * at)
@@ -337,11 +339,15 @@ def ten_of_two_sets(first, second) -> Verification:
 
 def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     assert ten_of_two_sets(1.0, 0.1).warnings == []
-    for before in (0.1, 1.0):
-        assert "no less than set before" in ten_of_two_sets(before, 1.0).warnings[0]
+    for before, words in ((0.1, "no less than set before"), (1.0, "hardly less than set before")):
+        assert words in ten_of_two_sets(before, 1.0).warnings[0]
     ten = np.random.default_rng(6).uniform(-500, 500, (10, 3))
     larger = verified(ten, a=1.002 * ten)
     assert "1.002 times the commanded ones, which is most of their error" in larger.warnings[0]
+    both = verified(ten, a=1.002 * ten, b=1.002 * ten + 1e-3).warnings
+    assert "set b: errs by" in both[2]
+    noisy = verified(ten, a=1.01 * ten + np.random.default_rng(0).normal(0, 6, ten.shape))
+    assert re.search(r"are 1\.0[01]\d+ times the commanded ones, 0\.995 to 1\.005 allowed", noisy.warnings[0])
     assert "are the commanded ones to the last digit" in ten_of_two_sets(0.0, 0.1).warnings[0]
     both = ten_of_two_sets(1.0, 0.0)
     assert "set after: measured positions are the commanded ones" in both.warnings[0]
