@@ -40,8 +40,7 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
     ratio = high / max(middle, 1e-9) * np.exp(TAIL_SIGMAS * np.sqrt(variance))
 
     def off(logarithm: float) -> float:
-        freedom = float(np.exp(logarithm))
-        return quantile(TAIL, freedom) / quantile(0.5, freedom) - ratio
+        return quantile(TAIL, np.exp(logarithm)) / quantile(0.5, np.exp(logarithm)) - ratio
 
     low, high = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
     logarithm = high if off(high) > 0 else brentq(off, low, high) if off(low) > 0 else low

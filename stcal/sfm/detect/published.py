@@ -57,9 +57,8 @@ class PublishedPattern:
 
     def __init__(self, target: TargetDesign):
         if not (target.faces and all(sorted(f.ids) == CIRCLES for f in target.faces) and self._read(target)):
-            fault = f"target {target.name}: its faces have not the circles 1 to 7, a, b and c of Zhang & Wei (2017) at "
-            fault += "their places and in their sizes, which --solve paper needs"
-            raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}; use joint or chain")
+            fault = f"target {target.name}: its circles are not 1 to 7, a, b, c of Zhang & Wei (2017) in place and size"
+            raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}, which --solve paper needs; use joint or chain")
 
     def _read(self, target: TargetDesign) -> bool:
         """Reads sizes and names; returns whether the circles lie as published."""

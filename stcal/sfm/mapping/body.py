@@ -405,9 +405,8 @@ def contradictions(body: Body, corners: BodyCorners) -> list[Outlier]:
     outliers = []
     for k in np.flatnonzero(length > limit):
         image, label = used.images[used.image[k]], used.faces[used.face[k]].labels()[used.corner[k]]
-        outliers.append(
-            Outlier(image, label, *(np.array([length[k], limit[k]]) / np.linalg.norm(used.root[k], 2)).tolist())
-        )
+        size_px = np.array([length[k], limit[k]]) / np.linalg.norm(used.root[k], 2)
+        outliers.append(Outlier(image, label, *size_px.tolist()))
     return outliers
 
 
