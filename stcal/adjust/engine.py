@@ -272,11 +272,12 @@ class Solution:
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Return the step of kept, then eliminated unknowns, damped for the kept ones, and its predicted gain."""
-        if not np.isfinite(self.normal).all():
+        with np.errstate(all="ignore"):
+            scale = np.sqrt(np.maximum(np.diag(self.normal), TINY))
+            unit = self.normal / scale[:, None] / scale + damping * np.eye(self.kept)
+        if not np.isfinite(unit).all():
             fault = "adjustment: no minimum, as its equations are not finite"
-            raise ConvergenceError("E-NO-MINIMUM", f"{fault}; check all sizes that are stated, and the camera")
-        scale = np.sqrt(np.maximum(np.diag(self.normal), TINY))
-        unit = self.normal / scale[:, None] / scale + damping * np.eye(self.kept)
+            raise ConvergenceError("E-NO-MINIMUM", f"{fault}; check the values and σ given")
         try:
             kept = cho_solve(cho_factor(unit), self.right / scale) / scale
         except LinAlgError:

@@ -4,6 +4,7 @@ length is the norm of d coordinates over their σ, of normal errors the root of 
 from functools import partial
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri
 
 HUBER = 3.0
@@ -17,6 +18,34 @@ def length_limit(coordinates: int, beyond: float) -> float:
 
 median_length = partial(length_limit, beyond=0.5)
 """Return the median length of normal errors in a number of coordinates, in σ."""
+TAIL = 0.05
+"""Share of the lengths beyond the quantile that tells how heavy the tail is: gross errors are fewer."""
+TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
+"""Number of sampling errors of the quantiles that a tail is allowed; limits of the degrees of freedom."""
+
+
+def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
+    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a
+    sample (n,). Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the
+    fewest that the ratio of two quantiles admits, both far below gross errors. ``together`` : number of lengths that
+    share an error."""
+
+    def quantile(exceeded: float, freedom: float) -> float:
+        return float(np.sqrt(freedom * np.expm1(-2 / freedom * np.log(exceeded))))
+
+    middle, high = np.quantile(length, [0.5, 1 - TAIL])
+    # Variances of logarithms of quantiles, of normal errors.
+    far, near = length_limit(2, TAIL) ** 2, length_limit(2, 0.5) ** 2
+    variance = ((1 - TAIL) / TAIL / far**2 + 1 / near**2 - 2 / far / near) * together / len(length)
+    ratio = high / max(middle, 1e-9) * np.exp(TAIL_SIGMAS * np.sqrt(variance))
+
+    def off(logarithm: float) -> float:
+        return quantile(TAIL, np.exp(logarithm)) / quantile(0.5, np.exp(logarithm)) - ratio
+
+    low, high = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
+    logarithm = high if off(high) > 0 else brentq(off, low, high) if off(low) > 0 else low
+    freedom = float(np.exp(np.asarray(logarithm, float)))
+    return max(quantile(beyond, freedom) * middle / quantile(0.5, freedom), length_limit(2, beyond))
 
 
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:

@@ -10,6 +10,7 @@ from stcal.adjust import Adjustment, Huber, Vector
 from stcal.adjust.blocks import component_variances
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, by_pose, perspective
+from tests.outcome import refuses
 
 SIGMA, IMAGES, POINTS = 0.002, 6, 12
 
@@ -166,6 +167,9 @@ def test_mistakes_are_named():
     b.factor(lambda v: v.array - 1, [(y, None)])
     with pytest.raises(InputError, match="no factor has clusters"):
         b.solve().by_clusters(y)
+    solution = b.at({"y": y.start})
+    vars(solution)["normal"] = np.array([[-1e200]])  # finite; scaled by a diagonal that is not positive, it is not
+    refuses("E-NO-MINIMUM … adjustment … not finite … values and σ", solution.step, 0.0)
 
 
 def test_a_member_that_its_rows_do_not_determine_stays():

@@ -16,6 +16,7 @@ from stcal.geometry.robust import (
     ratio_limit,
     robust_sigma,
     robust_sigmas,
+    tailed_limit,
 )
 from tests.outcome import refuses
 
@@ -115,6 +116,24 @@ def test_the_middle_of_few_lengths(count):
 @pytest.mark.parametrize("beyond", [0.3, 1e-3, 1e-9])
 def test_a_ratio_is_beyond_its_limit_as_seldom_as_said(beyond, redundancy):
     assert stats.f.sf(ratio_limit(beyond, 3, redundancy), 3, redundancy) == pytest.approx(beyond, rel=1e-6)
+
+
+@pytest.mark.parametrize(("freedom", "least"), [(np.inf, 4.4), (8, 8.0), (4, 15.0)])
+def test_the_limit_of_lengths_follows_their_tail(freedom, least):
+    """Sound lengths beyond the limit are rare, 0.01 in a sample; gross ones do not move it much.
+
+    ``least`` : the quantile of Student's distribution, of 0.01 / 200."""
+    rng, count, draws = np.random.default_rng(3), 200, 100
+    beyond, limits, spoiled = 0, [], []
+    for _ in range(draws):
+        shrunk = 1.0 if np.isinf(freedom) else np.sqrt(rng.chisquare(freedom, (count, 1)) / freedom)
+        length = np.linalg.norm(rng.normal(size=(count, 2)) / shrunk, axis=1)
+        limits.append(tailed_limit(length, 0.01 / count))
+        beyond += int((length > limits[-1]).sum())
+        spoiled.append(tailed_limit(np.append(length, [60.0, 200.0]), 0.01 / count))
+    assert beyond <= 5  # 1 expected where the tail was known
+    assert np.median(spoiled) < 1.5 * np.median(limits)
+    assert least * 0.8 < np.median(limits) < 3 * least
 
 
 def drawn(rng, n: int, common: float, q: int = 4, rows: int = 30):

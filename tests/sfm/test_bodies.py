@@ -1,5 +1,5 @@
 """Bodies whose faces are boards or tags: no dot board and no camera file are needed. Faces that are not where the
-design draws them, and groups that show others than they are named after."""
+design draws them."""
 
 import json
 import re
@@ -182,10 +182,9 @@ def test_of_photographs_of_tags_only_planted_corners_contradict(seed):
         images.append(ImageObservations(f"{i}.png", ".", labels, xy, 0 * xy, 0 * covariance, covariance))
 
     def left_out() -> list[tuple[str, str]]:
-        body = place_with_camera(images, target.faces, scene.camera)
-        model = map_body(body, images, scene.camera).model
-        refined = refine(model, scene.camera, target, scale_reference(None, target))
-        return [(each.image, str(each.label)) for each in refined.outliers]
+        mapping = map_body(place_with_camera(images, target.faces, scene.camera), images, scene.camera)
+        refined = refine(mapping.model, scene.camera, target, scale_reference(None, target))
+        return [(each.image, str(each.label)) for each in (*mapping.outliers, *refined.outliers)]
 
     assert left_out() == []
     moved = images[3].centre_px.copy()
@@ -469,6 +468,7 @@ def test_a_body_as_drawn_says_nothing_and_sizes_and_faces_that_are_not_are_named
     poses["2"], poses["5"] = poses["5"], poses["2"]
     [turned] = not_as_drawn(poses, CUBE)
     assert re.search(r"face 2 is turned by \d+°, face 5 is turned by \d+°", turned)
+    assert "as if the names of faces 2 and 5 were exchanged" in turned
     turn = Rigid.exp([0, 0, np.pi / 2, 0, 0, 0])
     poses = found()
     [turned] = not_as_drawn(poses | {"4": poses["4"] @ turn}, CUBE)

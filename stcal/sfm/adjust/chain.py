@@ -23,7 +23,7 @@ FrameKind = Literal["plane", "three-point"]
 MIN_KNOWN = 3  # smallest number of points of a face of known shape that place it
 MIN_PLACING = 4
 """Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
-shows how good it is."""
+lessens the effect of their errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,10 @@ def with_known(
     common = [c for c in xyz if c in known]
     if face.sigma_mm is not None or not missing or len(common) < MIN_PLACING:
         return dict(xyz)
-    model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
+    try:
+        model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
+    except DegenerateError:  # on one line: that frame circles are missing is said elsewhere
+        return dict(xyz)
     return dict(xyz) | {c: model_from_known @ known[c] for c in missing}
 
 

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from itertools import combinations
 from typing import Self, TypeVar
 
 import numpy as np
@@ -393,6 +394,11 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
         return notes
     what = ", ".join(f"face {face} is turned by {angle:.0f}°" for face, angle in turned.items())
     what += " against rough_pose in target.toml"
+    for a, b in combinations(turned, 2):
+        exchanged = rough | {a: rough[b], b: rough[a]}
+        if not {a, b} & turned_faces(found, exchanged).keys():
+            what += f", as if the names of faces {a} and {b} were exchanged"
+            break
     folders = "put the photographs of each setting of target and board into a folder of its own; or " * one_folder
     return [*notes, Note(what, NOT_AS_DRAWN, remedy=f"{folders}correct names, ids or rough_pose", then=": ")]
 

@@ -42,6 +42,7 @@ AREA_RATIO = 2.0  # largest ratio of areas of equal circles in one pattern, due 
 STEP_RATIO = 1.4  # largest ratio of distances between neighbouring circles, due to perspective
 ZERO_COSINE = float(np.sin(np.radians(22.5)))
 """Largest cosine of directions that count as perpendicular: half way to those 45° off."""
+SAME_SIZE = 0.75  # least radius of a large or a small circle, as a share of the largest; small ones have no more
 MAX_MISFIT = 0.25  # largest distance of a circle from its place in the face's plane, in radii
 
 
@@ -55,14 +56,14 @@ class PublishedPattern:
     """Pattern of the published rules: sizes, and names of faces; an error if the design has another form."""
 
     def __init__(self, target: TargetDesign):
-        if not (all(sorted(face.ids) == CIRCLES for face in target.faces) and self._read(target)):
-            fault = f"target {target.name}: its faces have not the circles 1 to 7, a, b and c of Zhang & Wei (2017)"
+        if not (target.faces and all(sorted(f.ids) == CIRCLES for f in target.faces) and self._read(target)):
+            fault = f"target {target.name}: its circles are not 1 to 7, a, b, c of Zhang & Wei (2017) in place and size"
             raise InputError("E-TARGET-NOT-PUBLISHED", f"{fault}, which --solve paper needs; use joint or chain")
 
     def _read(self, target: TargetDesign) -> bool:
         """Reads sizes and names; returns whether the circles lie as published."""
-        first = target.faces[0]
-        radius = dict(zip(first.ids, first.radius_mm.tolist(), strict=True))
+        radii = np.array([[face.radius_mm[face.ids.index(i)] for i in CIRCLES] for face in target.faces])
+        radius, large, small = dict(zip(CIRCLES, radii[0].tolist(), strict=True)), radii[:, :7], radii[:, 7:]
         xy = np.array([face.places_mm(CIRCLES)[:, :2] for face in target.faces])
         along, step = xy[0, 1:7].max(1), xy[0, 7, 0]  # of circles 2 to 7 from circle 1, and of a
         ways = np.repeat([[1, 0], [0, 1], [1, 1]], 2, axis=0)
@@ -71,13 +72,15 @@ class PublishedPattern:
         distances = np.linalg.norm(directions, axis=1)
         # circles along X, Y and the diagonal from circle 1 on: (id, distance in steps)
         pairs = zip(LINES, (along / step).reshape(3, 2).tolist(), strict=True)
-        self.lines = [list(zip(circles, steps, strict=True)) for circles, steps in pairs]
+        self.lines = [sorted(zip(*line, strict=True), key=lambda each: each[1]) for line in pairs]
         self.step_radii = step / radius["1"]  # distance from circle 1 to a in radii of circle 1
         self.c_radii = distances[0] / radius["7"]
         self.small = (radius["a"] / radius["1"]) ** 2  # ratio of the areas of small and large circles
         # face id by (sign of the scalar, of the vector product) of the direction of c with the diagonal
         self.names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
         is_told_apart = len(self.names) == len(target.faces) and np.allclose(distances, distances[0], rtol=0.05)
+        is_alike = all(each.min() > SAME_SIZE * each.max() for each in (large, small))
+        is_told_apart &= is_alike and small.max() <= SAME_SIZE * large.max()
         return is_told_apart and along.min() > step and np.allclose(xy[:, :9], published, atol=0.01 * step)
 
 

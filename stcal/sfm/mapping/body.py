@@ -21,9 +21,9 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Normal, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
-from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
+from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
-from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, WorldModel, assemble
+from stcal.sfm.data.group_model import MIN_POINTS, ImageObservations, Outlier, WorldModel, assemble
 from stcal.sfm.mapping import incremental
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD, Mapping, rays_of, widest_angle_rad
 
@@ -49,6 +49,8 @@ MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 LEAST_SIGMA_OFF = 0.02  # σ of such a logarithm that the reflections of views and a rough camera leave to any
 LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
 BETTER = 0.2  # share by which another pose of a face must fit its corners better
+BY_CHANCE = 0.01  # number of sound corners in a run that may be taken for gross errors
+SHARING = 2  # number of corners that share the error of an edge
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
@@ -387,6 +389,27 @@ def settled_body(body: Body, corners: BodyCorners, basis: np.ndarray, prior: np.
     return body
 
 
+def contradictions(body: Body, corners: BodyCorners) -> list[Outlier]:
+    """Returns the corners that lie elsewhere than the rigid body has them, with a limit by their number and their tail.
+    Lengths are compared with those of the same corner in other images too: a print that is off is no gross error."""
+    printed = np.array([face.sigma_mm is not None for face in corners.faces])
+    used = corners.select(body.used(corners) & printed[corners.face])
+    length = np.minimum(body.lengths(used), 1e6)
+    if not len(length):
+        return []
+    usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
+    _, corner = np.unique(np.column_stack([used.face, used.corner]), axis=0, return_inverse=True)
+    for own in (corner == k for k in range(corner.max() + 1)):
+        usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
+    limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
+    outliers = []
+    for k in np.flatnonzero(length > limit):
+        image, label = used.images[used.image[k]], used.faces[used.face[k]].labels()[used.corner[k]]
+        size_px = np.array([length[k], limit[k]]) / np.linalg.norm(used.root[k], 2)
+        outliers.append(Outlier(image, label, *size_px.tolist()))
+    return outliers
+
+
 def _robust(length: np.ndarray) -> float:
     """Returns the cost of residuals of these lengths, in σ, that hardly grows with gross ones."""
     return float((np.minimum(length, 1e3) ** 0.5).sum())
@@ -403,6 +426,7 @@ class PlacedBody:
         self.camera_from_body = {corners.images[i]: body.camera_from_body[i] for i in images}
         # faces that are seen, and never with a placed one
         self.unlinked = [corners.faces[f].id for f in np.unique(corners.face) if not body.placed_faces[f]]
+        self.contradictions = contradictions(body, corners)  # corners that lie elsewhere than the body has them
 
     def unlinked_notes(self) -> list[str]:
         """Returns a note for each face of known shape that no image shows together with one that is placed."""
@@ -512,6 +536,9 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
 
 
 def map_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> Mapping:
-    """Maps one group by a body that its faces have placed; its refinement leaves out what contradicts."""
+    """Maps one group by a body that its faces have placed, without the corners that contradict it."""
     model = model_of_body(body, group, camera)
-    return Mapping(model, (), incremental.left_out(group, model, SHOW_MORE), BY_FACES, SHOW_MORE)
+    gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+    is_gross = np.array([seen in gross for seen in model.seen()], bool)
+    missing = incremental.left_out(group, model, SHOW_MORE)
+    return Mapping(model.without(is_gross), tuple(gross.values()), missing, BY_FACES, SHOW_MORE)

@@ -84,6 +84,7 @@ MIN_AGREEMENT = 0.5  # share of the circles seen at least twice that a model mus
 LOG_ERRORS_ONLY = 3
 SHOW_BOTH = "photograph faces and board together"
 BY_PAIR = "the relative pose of the chosen pair"
+BY_COLMAP = "COLMAP's estimate of the chosen pair"
 BY_BOARD = f"{BY_PAIR}, by the board (a plane has two essential matrices)"
 
 
@@ -107,11 +108,15 @@ def map_group(
     camera: Camera,
 ) -> Mapping:
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair and its pose in the ranking, the other images
-    are resected by their labels."""
+    are resected by their labels. If that gives no model, COLMAP estimates the pair's pose itself."""
     names, pair = [i.name for i in group if i.name in skeleton], pairs[0]
+    by_board = share_board_alone(*(i for i in group if i.name in (pair.first, pair.second)))
+    seed, how = (ids[pair.first], ids[pair.second]), BY_BOARD if by_board else BY_PAIR
     assert pair.second_from_first is not None, "chosen pairs have a pose"
     try:
-        reconstruction = _mapped(database, names, (ids[pair.first], ids[pair.second]), pair.second_from_first)
+        reconstruction = _mapped(database, names, seed, pair.second_from_first)
+        if reconstruction is None:
+            reconstruction, how = seeded_mapping(database, Path(f"{database}.models"), names, seed), BY_COLMAP
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise
@@ -128,8 +133,7 @@ def map_group(
         fault = f"group {model.group}: {agree}, {MIN_AGREEMENT * wanted:.0f} needed"
         remedy = "check that the camera file belongs to the images, and that nothing but the camera moved"
         raise MappingError("E-MAPPING-DISAGREE", f"{fault}; {remedy}")
-    by_board = share_board_alone(*(i for i in group if i.name in (pair.first, pair.second)))
-    return Mapping(model, outliers, left_out(group, model), BY_BOARD if by_board else BY_PAIR, SHOW_BOTH)
+    return Mapping(model, outliers, left_out(group, model), how, SHOW_BOTH)
 
 
 def left_out(group: Sequence[ImageObservations], model: WorldModel, remedy: str = SHOW_BOTH) -> dict[str, str]:

@@ -75,11 +75,13 @@ def rank_pairs(
         scores.remove(over[-1])
         return [replace(over[-1], verdict=f"chosen: the smallest {OVER_LIMIT}, none is under it"), *scores]
     if not scores or scores[0].verdict != "usable":
-        why = "1 usable image, 2 needed"
+        why, remedy = "1 usable image, 2 needed", "photograph faces and board together, from different places"
         if scores:
-            why = f"{scores[0].first}, {scores[0].second}: {scores[0].verdict}"
-        remedy = "photograph faces and board together, from different places with views in between; check that the "
-        remedy += "camera file belongs to the images, and that nothing but the camera moved; or raise --max-angle"
+            best = (over[::-1] or scores)[0]
+            angle = f" (median ray angle {np.degrees(best.median_angle_rad):.2f}°)" if best.second_from_first else ""
+            why = f"{best.first}, {best.second}: {best.verdict}{angle}"
+            remedy += " with views in between; check that the camera file belongs to the images, and that nothing but "
+            remedy += "the camera moved" + "; or raise --max-angle" * bool(over)
         raise MappingError("E-MAPPING-NO-PAIR", f"group {group[0].group}: no initial pair, {why}; {remedy}")
     return [replace(scores[0], verdict="chosen"), *scores[1:]]
 

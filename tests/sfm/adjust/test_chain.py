@@ -5,7 +5,7 @@ import pytest
 
 from stcal import Rigid, reference_target
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
-from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains
+from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains, with_known
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with, refuses
 
@@ -32,6 +32,7 @@ def test_frames_are_exact_on_exact_circles_and_that_of_the_plane_spreads_less():
     assert 0.3 < spread["plane"] / spread["three-point"] < 0.8
     with fails_with("E-FACE-FRAME-CIRCLES … 1:3 and 1:5"):
         face_frame(FACE, circles(keep="12467abc"), "plane", np.array([0, 0, 1.0]))
+    assert with_known(FACE, circles(keep="1a23"), circles()).keys() == set("1a23")  # those on one line place no other
 
 
 TRUE = {

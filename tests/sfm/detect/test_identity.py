@@ -3,6 +3,7 @@ boards among them: naming, hiding, reflections, clutter, numbering; the publishe
 board's grid among the outlines of a photograph."""
 
 from dataclasses import replace
+from operator import itemgetter
 
 import cv2
 import numpy as np
@@ -302,8 +303,14 @@ def test_the_published_rules_know_the_reference_design_alone():
     face = TARGET.face("1")
     xy = face.xy_mm.copy()
     xy[face.ids.index("6")] = (50.0, 30.0)
-    other = TargetDesign("other", "bright", (replace(face, xy_mm=xy), TARGET.face("2")))
-    refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern, other)
+    sizes = [face.radius_mm * np.where(np.array(face.ids) == i, share, 1) for i, share in (("a", 2), ("4", 0.5))]
+    first = [replace(face, xy_mm=xy), *(replace(face, radius_mm=radius) for radius in sizes)]
+    for faces in ((), *((each, TARGET.face("2")) for each in first)):
+        refuses("E-TARGET-NOT-PUBLISHED … other", PublishedPattern, TargetDesign("other", "bright", faces))
+    ids = [tuple({"2": "3", "3": "2"}.get(i, i) for i in each.ids) for each in TARGET.faces]
+    turned = [replace(each, ids=own, x="2") for each, own in zip(TARGET.faces, ids, strict=True)]
+    lines = PublishedPattern(TargetDesign("other", "bright", tuple(turned))).lines
+    assert [*map(itemgetter(0), lines[0])] == ["3", "2"]  # the nearer one first
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 from stcal import InputError, Rigid
 from stcal.sfm.mapping.database import from_colmap_px, image_ids, match_labels, to_colmap_px, write_database
-from stcal.sfm.mapping.incremental import map_group
+from stcal.sfm.mapping.incremental import BY_COLMAP, map_group
 from stcal.sfm.mapping.pairs import PairOptions, image_graph, rank_pairs, triangulate
 from tests.outcome import fails_with, refuses
 
@@ -75,7 +75,8 @@ def test_groups_without_an_initial_pair_say_why(scene, group):
         turned.append(replace(group[0], name=f"12/{i}", centre=rays[:, :2] / rays[:, 2:]))
     few = [group[0].select(range(6)), group[1].select(range(6, 12))]
     for images, options, error in (
-        (still, PairOptions(), "E-MAPPING-NO-PAIR … 12: … 1"),
+        (group[:1], PairOptions(), "E-MAPPING-NO-PAIR … 12: … 1 … from different places"),
+        (still, PairOptions(), "E-MAPPING-NO-PAIR … 12: … 1 … median ray angle 0. … camera moved"),
         (turned, PairOptions(), "E-MAPPING-NO-PAIR"),
         (few, PairOptions(), "E-MAPPING-NO-PAIR … 8"),
         (group[:2], PairOptions(np.radians(1.5)), "E-MAPPING-NO-PAIR … --max-angle"),
@@ -165,6 +166,10 @@ def test_all_images_are_mapped_from_the_pair_or_no_model_is_named(scene, observe
     own, mapping = map_one(scene, observed, database, "12")
     assert set(mapping.model.images) == {o.name for o in own}
     monkeypatch.setattr("stcal.sfm.mapping.incremental._mapped", lambda *_: None)
+    own, mapping = map_one(scene, observed, database, "12")
+    assert (set(mapping.model.images), mapping.seeded) == ({o.name for o in own}, BY_COLMAP)
+    assert sorted(p.name for p in database.parent.iterdir()) == ["database.db"]
+    monkeypatch.setattr("stcal.sfm.mapping.incremental.seeded_mapping", lambda *_: None)
     with fails_with("E-MAPPING-NO-MODEL … 12"):
         map_one(scene, observed, database, "12")
 

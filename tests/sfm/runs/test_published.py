@@ -96,7 +96,7 @@ def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
 
 def test_where_there_is_no_published_answer_the_others_are_compared(small_result, monkeypatch):
     monkeypatch.setattr(comparisons, "in_steps", lambda _: {})
-    error = InputError("E-TARGET-NOT-PUBLISHED", "target other: not read by the rules of Zhang & Wei")
+    error = InputError("E-TARGET-NOT-PUBLISHED", "target other: its circles are not 1 to 7, a, b, c; use joint")
     first, last = comparisons.compare_with_paper(small_result, error).rows
     assert (first.method, first.faces, first.reason) == (AS_PUBLISHED, {}, str(error))
     assert (last.reason, last.residual_rms_px > 0) == (None, True)
