@@ -364,7 +364,8 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
         in_place = np.arange(len(few.ids)) if few is many else None
         like = whole_likeness(few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, in_place)
         if like is not None:
-            as_on = f"are all on face {many.id} too, at {like.scale:.2f} times the size"
+            size = "" if abs(like.scale - 1) < 0.005 else f", at {like.scale:.2f} times the size"
+            as_on = f"are all on face {many.id} too{size}"
             after = f"look the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
             by = f"its place by more than {MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}"
             fault = f"{where}: the circles of face {few.id} {after if few is many else as_on}"

@@ -494,5 +494,7 @@ def drawn_text(drawn: Drawn) -> str:
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         lines.append(f"sheets without dimensions, which would take more sheets: {bare} of {sheets}")
     if drawn.paper != OWN and sheets > len(drawn.parts):
-        lines.append("parts glued of several sheets are off at the seams: state it in sigma_mm, or take larger paper")
+        whole = paper_for(drawn.parts)
+        larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
+        lines.append(f"parts glued of several sheets are off at the seams: state it in sigma_mm, or {larger}")
     return "\n".join(lines)

@@ -246,6 +246,7 @@ def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), ou
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
 TAB_MM, TAB_SHARE = 10.0, 0.25  # largest width of a tab, mm, and as a share of its edge
+SKETCH, BESIDE = 1 / 8, 15.0  # scale of the sketch that names the faces, and its distance from the net, mm
 LETTERS = 2.0  # height of names, mm
 IN_CORNER = 3.0
 """Distance of the name of a printed face from the corner of its plate, mm: in the white about a tag."""
@@ -351,7 +352,7 @@ def _is_clear(one: np.ndarray, others: Iterable[np.ndarray]) -> bool:
 
 
 def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], folds: set[Edge]) -> Piece:
-    """Return the plates with what is to cut and fold, and tabs under their partners."""
+    """Return the plates with what is to cut and fold, tabs under their partners, and a sketch with names."""
     grounds: list[Shape] = []
     shapes: list[Shape] = []
     lines: list[Outline] = []
@@ -379,8 +380,9 @@ def _folded(plates: list[_Plate], polarity: Polarity, shared: dict[Edge, Edge], 
             level = abs(ends[0, 1] - ends[1, 1]) < abs(ends[0, 0] - ends[1, 0])
             at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
             shapes.append(Text(*at, f"under {partner[0]}", LETTERS, "middle", turned=not level))
-    outline = corners_of(box_of(np.concatenate(taken)))
-    return Piece("net", outline, (*grounds, *shapes), lines=tuple(lines))
+    box = box_of(np.concatenate(taken))
+    sketch = _sketch(plates, np.array([box[1, 0] + BESIDE, box[1, 1]]))
+    return Piece("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
 
 
 def _tab(ends: np.ndarray) -> np.ndarray:
@@ -391,3 +393,15 @@ def _tab(ends: np.ndarray) -> np.ndarray:
     out = np.array([along[1], -along[0]])
     width = min(TAB_MM, TAB_SHARE * length)
     return np.array([ends[0], ends[0] + width * (along + out), ends[1] + width * (out - along), ends[1]])
+
+
+def _sketch(plates: list[_Plate], left_above: np.ndarray) -> list[Shape]:
+    """Return a small sketch of the plates, each with the name of its face."""
+    every = np.concatenate([plate.corners for plate in plates])
+    shift = left_above - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
+    shapes: list[Shape] = []
+    for plate in plates:
+        corners = SKETCH * plate.corners + shift
+        x, y = corners.mean(0).tolist()
+        shapes += [line(corners, "LABELS", closed=True), Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle")]
+    return shapes

@@ -161,7 +161,9 @@ def require_fields(instance: object, what: str, **least: float) -> None:
         value = getattr(instance, name)
         _require(what, name, value, known)
         if name in least and value is not None and value < least[name]:
-            raise InputError("E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed")
+            raise InputError(
+                "E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed; give another"
+            )
 
 
 def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
@@ -312,7 +314,7 @@ def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = Fal
         odd = np.abs(matrices - np.swapaxes(matrices, 1, 2)) - np.sqrt(np.outer(nothing, nothing))
         odd /= scales
         usable = (variance >= 0) & (variance <= LARGEST) & (odd <= ROUNDING * size).all(axis=2)
-    usable = usable.all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))
+    usable = usable.all(axis=1) & np.isfinite(matrices).all(axis=(1, 2)) & np.isfinite(correlation).all(axis=(1, 2))
     lowest = np.full(len(matrices), -np.inf)
     lowest[usable] = np.linalg.eigvalsh(correlation[usable])[:, 0]
     bad = np.flatnonzero(~(lowest > 0 if definite else lowest >= -ROUNDING * size))
@@ -320,7 +322,8 @@ def first_fault(matrices: np.ndarray, rows: CovarianceRows, definite: bool = Fal
         return None
     row = int(bad[0])
     suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    return Fault(row, _reason(matrices[row], variance[row], odd[row], float(lowest[row]), rows, definite) + suffix)
+    reason = _reason(matrices[row], variance[row], odd[row], correlation[row], float(lowest[row]), rows, definite)
+    return Fault(row, reason + suffix)
 
 
 def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, definite: bool = False) -> None:
@@ -332,7 +335,7 @@ def require_covariance(matrix: np.ndarray, size: int, rows: CovarianceRows, defi
         raise InputError("E-COVARIANCE-VALUE", fault.reason)
 
 
-def _reason(matrix, variance, odd, lowest: float, rows: CovarianceRows, definite: bool) -> str:
+def _reason(matrix, variance, odd, correlation, lowest: float, rows: CovarianceRows, definite: bool) -> str:
     """Return why one matrix is not a covariance; ``odd`` : asymmetry of its correlations."""
     needed, below = "a positive number" if definite else "0 or more", variance <= 0 if definite else variance < 0
     if not np.isfinite(matrix).all():
@@ -345,4 +348,8 @@ def _reason(matrix, variance, odd, lowest: float, rows: CovarianceRows, definite
         i, j = np.unravel_index(int(np.argmax(odd)), odd.shape)
         share = abs(matrix[i, j] - matrix[j, i]) / max(abs(matrix[i, j]), abs(matrix[j, i]))
         return f"not symmetric by {round(100 * share, 1):g} % at {rows.names[i]}, {rows.names[j]}"
+    off = np.abs(correlation - np.diag(np.diagonal(correlation)))
+    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+    if off[i, j] > 1 + ROUNDING * len(matrix):
+        return f"correlation {correlation[i, j]:.6g} of {rows.names[i]} and {rows.names[j]}, −1 to 1 needed"
     return f"its correlations have the eigenvalue {lowest:.3g}, {needed} needed"

@@ -349,6 +349,13 @@ class Affine(ByValue):
         m[:3, :3], m[:3, 3] = self.linear, self.translation
         return m
 
+    def inverse(self) -> "Affine":
+        """Return b_from_a; a singular linear part is refused."""
+        if np.linalg.cond(self.linear) > 1e12:
+            raise DegenerateError("E-AFFINE-SINGULAR", "affine transform: singular 3×3 part; an invertible one needed")
+        back = np.linalg.inv(self.linear)
+        return Affine(back, -back @ self.translation)
+
     def __matmul__(self, other: ArrayLike) -> np.ndarray:
         """Return points in frame a for points (..., 3) in frame b, mm."""
         return np.asarray(other, float) @ self.linear.T + self.translation
@@ -399,12 +406,11 @@ def alignments(
     of sum 1. Those of degenerate sets are finite and wrong."""
     mean_a, mean_b = weights @ xyz_a, weights @ xyz_b
     a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
-    weighted = weights[:, None] * a
-    cross = np.swapaxes(weighted, 1, 2) @ b
-    if model == "affine":
-        linear = cross @ np.linalg.pinv((np.swapaxes(b, 1, 2) * weights) @ b, hermitian=True)
+    if model == "affine":  # not by squares, which lose points that are off a plane by little
+        root = np.sqrt(weights)[:, None]
+        linear = np.swapaxes(np.linalg.pinv(root * b) @ (root * a), 1, 2)
     else:
-        linear, product = best_rotations(cross)
+        linear, product = best_rotations(np.swapaxes(weights[:, None] * a, 1, 2) @ b)
         if model == "similarity":
             linear = linear * (product / np.maximum(np.einsum("snk,snk,n->s", b, b, weights), 1e-300))[:, None, None]
     return linear, mean_a - (linear @ mean_b[:, :, None])[:, :, 0]

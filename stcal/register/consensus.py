@@ -258,11 +258,16 @@ def _motions(model: Model, transform: Transform) -> np.ndarray:
 
 def _moved(model: Model, transform: Affine, origin: np.ndarray, step: np.ndarray) -> Affine:
     """Returns the transform after a step of the parameters about ``origin``."""
-    change = (_motions(model, transform) @ step).reshape(3, 4)
-    linear, there = transform.linear + change[:, :3], transform @ origin + change[:, 3]
-    if model != AFFINE:
-        rotation, product = best_rotations(linear)
-        linear = rotation if model == RIGID else rotation * product / 3
+    if model == AFFINE:
+        change = step.reshape(3, 4)
+        linear, there = transform.linear + change[:, :3], transform @ origin + change[:, 3]
+    else:
+        scale = 1 + step[6:].sum()
+        if scale <= 0:
+            fault = "registration: the scale is not determined"
+            raise DegenerateError("E-REGISTER-SCALE", f"{fault}; are the covariances true?")
+        linear = scale * Rigid.exp([*step[:3], 0, 0, 0]).rotation @ transform.linear
+        there = transform @ origin + step[3:6]
     return Affine(linear, there - linear @ origin)
 
 

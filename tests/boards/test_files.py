@@ -324,7 +324,7 @@ WRONG_TARGETS = {
     "collinear": (changed("x_mm = 0, y_mm = 40", "x_mm = 80, y_mm = 0"), "E-TARGET-FRAME … 1 … 2 … 3"),
     "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "E-TARGET-FRAME"),
     "two faces alike": (TARGET + changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE),
-                        "E-TARGET-LIKENESS … 1 … 2 … 1.00 … change one"),
+                        "E-TARGET-LIKENESS … 1 … 2 too; change one"),
     "a face at another size": (
         TARGET + FACE_OF_60, "E-TARGET-LIKENESS … 1 … 2 … 1.50"),
     "a face among more circles": (

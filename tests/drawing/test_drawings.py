@@ -31,6 +31,7 @@ from stcal.drawing.draw import (
     POINT_MM,
     SIDE,
     draw,
+    drawn_text,
     framed,
     net_text,
     one_sheet,
@@ -239,6 +240,8 @@ def test_pages_of_a_pdf_have_the_size_of_the_paper_and_a_net_is_on_one_sheet(fil
     for sheet, size in zip(drawn.sheets, sizes, strict=True):
         np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
         assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
+    said = drawn_text(draw(files / "board.toml", tmp_path / "board.pdf", "A5"))
+    assert said.endswith("off at the seams: state it in sigma_mm, or print with --paper A3")
     drawn = draw(target, tmp_path / "net.pdf", net=True)  # 400 × 200 mm and more
     assert (drawn.paper, len(drawn.sheets)) == ("A2", 1)
     refuses("E-DRAW-SHEETS … --net … A3 … --paper A2", draw, target, tmp_path / "a3.pdf", paper="A3", net=True)
@@ -348,6 +351,8 @@ def test_a_box_is_one_net_whose_plates_meet_as_they_do_in_space_and_are_read_fro
     assert all(_is_clear(a, [b]) for a, b in combinations(plates.values(), 2))
     folds = [line for line in part.lines if line.layer == "FOLD"]
     tabs = [s.words for s in part.shapes if isinstance(s, Text) and s.words.startswith("under ")]
+    names = {s.words for s in part.shapes if isinstance(s, Text)}
+    assert {face.id for face in target.faces} <= names  # in the sketch beside it
     assert len(tabs) == 4  # of eight edges that two plates share four hold the net together
     assert len(folds) == 8  # and all eight are folded
     corners = np.concatenate(list(plates.values()))

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.arrays import OF_POSE, ROUNDING, CovarianceRows, first_fault, require_covariance
-from stcal.geometry.rigid import Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
+from stcal.geometry.arrays import OF_PIXEL, OF_POSE, ROUNDING, CovarianceRows, first_fault, require_covariance
+from stcal.geometry.rigid import Affine, Poses, Rigid, Similarity, UncertainRigid, align_rigid, align_similarity, skew
 from stcal.io.json import Part, PoseCovariance, checked
 from tests.outcome import fails_with, refuses
 
@@ -266,6 +266,12 @@ def test_degenerate(align, xyz_a, xyz_b, weights, message):
     refuses(message, align, xyz_a, xyz_b, weights)
 
 
+def test_an_affine_transform_is_inverted():
+    one, points = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3]), cloud(0, 4)
+    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
+    refuses("E-AFFINE-SINGULAR", Affine(np.ones((3, 3)), np.zeros(3)).inverse)
+
+
 SIGMA = np.array([1e-5, 2e-5, 3e-5, 0.01, 0.02, 500.0])
 """rad and mm: sixteen orders of magnitude between variances."""
 
@@ -293,12 +299,12 @@ def without_variance() -> np.ndarray:
 
 NONE = {
     "negative variance": (with_entry(3, 3, -3.0), "E-COVARIANCE-VALUE … -0.0003 … 0"),
-    "correlation of 9": (with_entry(3, 4, 9.0), "E-COVARIANCE-VALUE … -8 … 0"),
-    "correlation over 1": (with_entry(0, 5, -1.01), "E-COVARIANCE-VALUE … -0.01 … 0"),
+    "correlation of 9": (with_entry(3, 4, 9.0), "E-COVARIANCE-VALUE … correlation 9 of x and y, −1 to 1"),
+    "correlation over 1": (with_entry(0, 5, -1.01), "E-COVARIANCE-VALUE … correlation -1.01 of rx and z"),
     "not symmetric": (with_entry(0, 1, 0.5) + with_entry(0, 1, 0.06, both=False), "E-COVARIANCE-VALUE … 10.7"),
     "one side only": (with_entry(4, 2, 0.5, both=False), "E-COVARIANCE-VALUE … 100"),
     "not together": (without_a_reason_in_pairs(), "E-COVARIANCE-VALUE … -0.2 … 0"),
-    "covariance without variance": (without_variance(), "E-COVARIANCE-VALUE … eigenvalue … 0"),
+    "covariance without variance": (without_variance(), "E-COVARIANCE-VALUE … of x and y, −1 to 1"),
     "NaN": (with_entry(1, 1, np.nan), "E-COVARIANCE-VALUE"),
     "infinite": (with_entry(1, 1, np.inf), "E-COVARIANCE-VALUE"),
     "too large": (with_entry(5, 5, 1e300), "E-COVARIANCE-VALUE … 2.5 … 305 … 1 … 24"),
@@ -311,6 +317,11 @@ NONE = {
 def test_what_is_none_is_named(case):
     matrix, message = NONE[case]
     refuses(message, require_covariance, matrix, 6, OF_POSE)
+
+
+def test_a_covariance_of_what_has_no_variance_is_refused():
+    infinite = np.array([[0, 1e10], [1e10, 0]])
+    refuses("E-COVARIANCE-VALUE … inf of x and y, −1 to 1", require_covariance, infinite, 2, OF_PIXEL)
 
 
 def test_files_name_the_place_and_not_the_numbers():
@@ -341,7 +352,7 @@ def test_rounding_of_zero_passes(seed):
 def test_just_beyond_rounding_and_singular_where_it_is_inverted():
     low, high = (with_entry(0, 1, 1 + share * 6 * ROUNDING) for share in (0.5, 1.5))
     require_covariance(low, 6, OF_POSE)
-    refuses("E-COVARIANCE-VALUE … -9e-05", require_covariance, high, 6, OF_POSE)
+    refuses("E-COVARIANCE-VALUE … 1.00009 of rx and ry", require_covariance, high, 6, OF_POSE)
     stack = np.tile(np.diag(SIGMA**2), (5, 1, 1))
     assert first_fault(stack, OF_POSE, definite=True) is None
     stack[2, 5, 5] = stack[4, 5, 5] = 0

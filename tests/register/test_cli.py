@@ -202,7 +202,7 @@ def test_points_lines_units_and_noise_of_three_kinds(tmp_path):
         (with_cells([1, -2, -1, 4]), HEAD + ",sigma_mm", "E-SIGMA-VALUE … 3 … sigma … -2 … (and 1 more)"),
         (with_cells(["1,1"] * 4), HEAD + ",sigma_mm,weight", "E-TABLE-COLUMNS-CONFLICT … weight and sigma"),
         (with_cells(["1,2"] * 4), HEAD + ",cov_x_x,cov_x_y", "E-TABLE-COLUMN-MISSING … cov_x_z … 6"),
-        (with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]), f"{HEAD},{COV}", "E-TABLE-COVARIANCE … 5 … -1"),
+        (with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]), f"{HEAD},{COV}", "E-TABLE-COVARIANCE … 5 … 2 of x and y"),
     ],
 )
 def test_bad_files(tmp_path, rows, head, message):

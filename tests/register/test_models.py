@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Affine, Rigid, Similarity, align_rigid
 from stcal.register import Liu2017Options, register
-from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, MODELS, Problem, problem_of
+from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, MODELS, Problem, _moved, problem_of
 from stcal.register.registered import held_out
 from stcal.register.registration import affine_least_squares, liu2017
 from tests.levels import sampled
@@ -90,6 +90,21 @@ def test_frames_may_be_moved(seed, name):
 
 
 RIGID = MODELS["rigid"]
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
+def test_a_long_step_keeps_the_model(model):
+    begin, step = Affine(np.eye(3), np.array([1.0, 2, 3])), np.linspace(-0.4, 0.5, model.parameters)
+    expected = perturbed(model.transform(begin), step).matrix()
+    moved = _moved(model, begin, np.zeros(3), step)
+    np.testing.assert_allclose(moved.matrix(), expected, atol=1e-12)
+
+
+def test_points_that_are_off_a_plane_by_little_determine_an_affine_transform():
+    xyz = np.random.default_rng(0).uniform(-500, 500, (30, 3)) * [1, 1, 2e-8]
+    truth = Affine([[1, 0.1, 0], [0, 1, 0], [0.2, 0, 1.1]], [1, 2, 3])
+    found = register(xyz, truth @ xyz, model="affine", method="least-squares").b_from_a
+    np.testing.assert_allclose(found.matrix(), truth.matrix(), atol=1e-6)
 
 
 def calibration(trials: int, n: int, share=0.0, given=False, **options) -> float:

@@ -254,8 +254,8 @@ def crosscheck(
     Raises
     ------
     InputError
-        There is no native program, or no schema of its version is known; it cannot list a name; the database is not the
-        run's; or other results took the run's place meanwhile.
+        There is no native program, or its version is not known to open the database; it cannot list a name; the
+        database is not the run's; or other results took the run's place meanwhile.
     MappingError
         The native program fails or hangs, or makes no model of a group, or one of another database.
     """

@@ -270,7 +270,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = "target
     run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` (a launch file of ROS
         2), ``.yml`` (OpenCV) or ``.csv``.
-    form : Form in place of that of the suffix.
+    form : ``urdf``, ``xacro``, ``tf2``, ``ros2``, ``opencv`` or ``csv``, in place of that of the suffix.
     name : Name of the target frame, and prefix of the other frames' names.
 
     Raises

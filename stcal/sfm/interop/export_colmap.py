@@ -135,7 +135,7 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> Exported:
     ----------
     run : The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : New or empty folder; missing parent folders are made.
-    form : The format.
+    form : ``colmap-bin`` or ``colmap-txt``.
 
     Raises
     ------

@@ -272,7 +272,9 @@ def trust(report: dict, judgement: Judgement) -> list[Block]:
     """Returns which errors no σ includes, and what residuals and chains tell of the σ."""
     summary = report["summary"]
     scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
-    if judgement.verdict != "no":
+    if report["options"]["solve"] != "joint":
+        scope = "No σ were computed: groups were solved one by one; look at the chains"
+    elif judgement.verdict != "no":
         absent = [] if report["options"].get("refine_camera") else ["the camera calibration"]
         pitch = "the pitch as a whole (100 ppm is 4 K on aluminium)"
         absent += [pitch] if "board" in summary.get("scale_from", ["board"]) else []
@@ -334,8 +336,8 @@ def crosscheck_section(check: dict) -> list[Block]:
         row += [*cells(entry, "translation_um:3 rotation_mdeg:3 sigmas:2")] if entry else [NONE] * 3
     over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
     return [
-        f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
-        f"{check['schema']} for the native one), initial pairs and thresholds",
+        f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (form of "
+        f"COLMAP {check['schema']}), initial pairs and thresholds",
         alarms([f"They differ: {'; '.join(check['differences'])}."]) if check["differences"] else "They agree",
         Table(["<Model", "Images", "Residual RMS (px)"], models),
         subheading("Faces"),

@@ -78,8 +78,10 @@ def test_with_nothing_stated_it_is_the_runs_own_covariance_and_contributions_add
     assert {face.name for face, _ in rows_of(plain, "position")} == {"2", "4", "5"}
     for kind, part, unit in (("position", slice(3, 6), 1e3), ("rotation", slice(3), 1e3 * np.degrees(1))):
         for face, found in rows_of(plain, kind):
-            own = unit**2 * np.diag(saved.faces.target_from_face_covariance[face.name])[part]
-            np.testing.assert_allclose(np.square(found.axes), own, rtol=0, atol=1e-3 * own.max())
+            own = saved.faces.target_from_face_covariance[face.name][part, part]
+            summed = sum(face.covariance(each) for each in plain.sources)
+            np.testing.assert_allclose(summed, own, rtol=0, atol=1e-3 * np.abs(own).max())
+            np.testing.assert_allclose(np.square(found.axes), unit**2 * np.diag(summed))
     (dots,) = (row for row in plain.sources if row.key == "board_dots")
     assert (dots.origin, "the default" in dots.words) == ("assumed", True)
     assert len(plain.rows) == 3 + 3 + 6 + 5

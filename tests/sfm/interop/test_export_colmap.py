@@ -438,7 +438,10 @@ def test_opencv_and_table(files, faces):
         ("box.csv", "stl", "target", "E-OPTION-FORM … --form … stl … urdf"),
         ("box.csv", "", "my box", "E-FRAME-NAME … --name … 'my box'"),
         ("no/box.csv", "", "target", "E-OUTPUT-FOLDER"),
+        ("mine.csv", "", "target", "E-OUTPUT-EXISTS"),
     ],
 )
 def test_refused(small_run, tmp_path, name, form, root, said):
+    (tmp_path / "mine.csv").write_text("mine", encoding="utf-8")
     refuses(said, export_run, small_run, tmp_path / name, form, root)
+    assert (tmp_path / "mine.csv").read_text(encoding="utf-8") == "mine"

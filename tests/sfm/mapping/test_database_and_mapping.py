@@ -165,6 +165,7 @@ def map_one(scene, observed, database, group):
 def test_all_images_are_mapped_from_the_pair_or_no_model_is_named(scene, observed, database, monkeypatch):
     own, mapping = map_one(scene, observed, database, "12")
     assert set(mapping.model.images) == {o.name for o in own}
+    assert "the relative pose of the chosen pair" in mapping.seeded
     monkeypatch.setattr("stcal.sfm.mapping.incremental._mapped", lambda *_: None)
     own, mapping = map_one(scene, observed, database, "12")
     assert (set(mapping.model.images), mapping.seeded) == ({o.name for o in own}, BY_COLMAP)

@@ -11,6 +11,8 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 from stcal import Camera, Rigid, reference_board, reference_target
+from stcal.boards.board_file import save_board
+from stcal.boards.target_file import save_target
 from stcal.io.cameras.camera_model import CameraModel, CameraPrior, model_of
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import equations
@@ -366,6 +368,17 @@ def test_plan_remedies_are_plans_of_their_own_and_a_fine_board_is_forecast_by_so
     np.testing.assert_allclose([sigma[face] for face in expected], list(expected.values()), rtol=0.05)
     assert observations == pytest.approx(all_observations, rel=0.05)
     assert some.stands_for > every.stands_for == 1
+
+
+@pytest.mark.slow
+def test_a_plan_of_a_design_of_ones_own_names_its_faces(stcal_sfm, tmp_path):
+    target, board, _ = second_design()
+    save_target(tmp_path / "target.toml", replace(target, faces=target.faces[:2]))
+    save_board(tmp_path / "board.toml", board)
+    designs = "--target", tmp_path / "target.toml", "--board", tmp_path / "board.toml"
+    code, out, _ = stcal_sfm("plan", *designs, "--images", 3, "--width", 1200)
+    assert code == 0
+    assert all(face.id in out for face in target.faces[:2])
 
 
 @pytest.mark.parametrize(

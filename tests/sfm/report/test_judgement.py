@@ -7,7 +7,7 @@ from stcal.errors import MappingError
 from stcal.sfm.data.group_model import ELSEWHERE, Note
 from stcal.sfm.report.check import CAUSE, CHECKS, OF_WHOLE_SET, Check, count_verdicts
 from stcal.sfm.report.judgement import judgement_of
-from stcal.sfm.report.run_page import report_html
+from stcal.sfm.report.run_page import report_html, trust
 from stcal.sfm.runs.report_file import Remark
 from tests.sfm.report.test_report import make
 
@@ -132,6 +132,8 @@ def test_each_source_has_its_own_remedy_and_some_results_are_not_without_care():
         found = judgement_of(own)
         assert found.verdict == verdict
         assert words in getattr(found, part)
+    own = make(sigma=False)
+    assert "solved one by one; look at the chains" in trust(own, judgement_of(own))[0]
 
 
 def test_the_board_alone_one_face_and_what_is_missing():
