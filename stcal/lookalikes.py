@@ -27,11 +27,10 @@ class Likeness:
 
 @kept
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
-    """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest
-    gap. ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among
-    the other's, if both are parts of one pattern; the motion that leaves them there is excluded. None if no motion
-    puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more than
-    ``MOST_CIRCLES``."""
+    """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap;
+    None if none does within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for more than ``MOST_CIRCLES``. ``xy``,
+    ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among the other's, a
+    motion that is excluded."""
     centres, other_centres = (x + 1j * y for x, y in (np.asarray(points, float).T for points in (xy, other_xy)))
     n, m = len(centres), len(other_centres)
     if not 2 <= n <= m <= MOST_CIRCLES:

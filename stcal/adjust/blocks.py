@@ -134,10 +134,9 @@ def component_variances(
     bounds: tuple[np.ndarray, np.ndarray],
     caution: float = 0.0,
 ) -> np.ndarray:
-    """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components. Of residuals (m,
-    a) near a solution and their derivatives (m, a, k) by what was solved for; ``known`` : (m, a, a) part of the
-    covariances; ``free`` : (f, m, a, a) components, each to be multiplied by its variance, from ``first`` (f,) and
-    within ``bounds``; ``caution`` : redundancy of each variance that is not counted."""
+    """Return restricted maximum-likelihood variances (f,) of ``free`` (f, m, a, a) beside ``known`` (m, a, a)
+    covariances of residuals (m, a) with derivatives (m, a, k), from ``first`` (f,) and within ``bounds``; ``caution`` :
+    redundancy of each variance that is not counted."""
     flat = jacobian.reshape(-1, jacobian.shape[2])
     u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
     jacobian = u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)  # an orthonormal basis of its columns

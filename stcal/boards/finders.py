@@ -204,9 +204,8 @@ LEAST_SIGMA_PX = 0.02
 
 def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardView | None:
     """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen. Each measurement
-    starts at the place that the surrounding corners predict, as one blurred tag alone may be several px off, and must
-    end near there: at the crossing of the edges by their areas; else where the gradients of the edges meet; else at the
-    saddle of the grey values."""
+    starts where the surrounding corners predict it, and must end near there: at the crossing of the edges by their
+    areas; else where their gradients meet; else at the saddle of the grey values."""
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
     if len(ids) < LEAST_CORNERS:

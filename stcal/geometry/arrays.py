@@ -161,9 +161,7 @@ def require_fields(instance: object, what: str, **least: float) -> None:
         value = getattr(instance, name)
         _require(what, name, value, known)
         if name in least and value is not None and value < least[name]:
-            raise InputError(
-                "E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed; give another"
-            )
+            raise InputError("E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed")
 
 
 def require_arguments(function: Callable[P, R]) -> Callable[P, R]:

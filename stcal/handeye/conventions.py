@@ -35,10 +35,9 @@ Guess = Callable[[Loop, bool], LoopState]
 
 
 def check_conventions(pairs: HandEyePoses, loop: Loop, guess: Guess, with_scale: bool, by_images: bool) -> Remarks:
-    """Refuse poses that fit far better in another convention, or in none; return notes on what the fit cannot decide.
-    With both sides inverted, X and Z change places, and only a board behind the camera shows it. ``guess`` : returns X,
-    Z and scale of a loop; ``by_images`` : the board's poses come from images, so that only the robot's can be named
-    wrongly. Raises InputError: the message says what is mixed up, and the remedy."""
+    """Refuse poses that fit far better in another convention, or in none, with the remedy; return notes on what the fit
+    cannot decide. With both sides inverted only a board behind the camera shows it. ``guess`` : returns X, Z and scale
+    of a loop; ``by_images`` : the board's poses come from images, so that only the robot's can be wrong."""
     turn, shift = as_read = _typical(loop, guess, with_scale)
     notes: Remarks = ()
     if turn > WELL[0] or shift > WELL[1]:

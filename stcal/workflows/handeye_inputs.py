@@ -268,11 +268,8 @@ class Files:
 
 
 class _Photographs:
-    """The ``images`` of a folder with the robot's poses, before the board is looked for.
-
-    ``row_of`` : row of the robot's pose by image; ``understood`` : how the poses were read and matched; ``clock`` :
-    where they were taken by time; ``left_out`` : (image, why).
-    """
+    """The ``images`` of a folder with the robot's poses, before the board is looked for: ``row_of`` an image, how poses
+    were ``understood``, the ``clock`` where they were taken by time, and (image, why) ``left_out``."""
 
     def __init__(self, files: Files, folder: Path):
         poses, camera, board = files.poses, files.camera, files.board

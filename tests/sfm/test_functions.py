@@ -102,7 +102,7 @@ def test_calibrate_models_and_runs_and_programs_that_are_missing(stcal_sfm, smal
     own = own_copy(small_run, tmp_path / "run")  # its lock is taken
     assert stcal_sfm("crosscheck", own, "--colmap", program).error == "E-COLMAP-PROGRAM"
     refuses("E-COLMAP-PROGRAM … no-colmap", sfm.crosscheck, small_run, program, sfm.Tolerances(sigma=1.0))
-    refuses("E-OPTION-RANGE … face_um … -1 … give another", sfm.Tolerances, -1.0)
+    refuses("E-OPTION-RANGE … face_um … -1 … or more needed", sfm.Tolerances, -1.0)
     refuses("E-FIELD-TYPE … tolerances … Tolerances", sfm.crosscheck, small_run, program, 0.5)
     for call in (sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise):
         refuses("E-FIELD-TYPE … 7", call, 7)

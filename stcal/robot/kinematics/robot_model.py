@@ -479,10 +479,9 @@ class Chain:
         return self.tree.path(len(self) - 1 if self.flange_joint is None else self.flange_joint)
 
     def parameters(self) -> list[tuple[int, int]]:
-        """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz. An
-        axis is a line: rotation about it and shift along it belong to the frames that follow, and of a prismatic joint
-        only the direction counts. With the six of one tool this is the complete, minimal and continuous set of 4 R + 2
-        P + 6 (Zhuang, Roth & Hamano 1992; Okamura & Park 1996)."""
+        """Returns (joint, component) of the minimal parameters of the chain's axes; 0–5 are rx, ry, rz, tx, ty, tz:
+        those that move the line, and of a prismatic joint its direction. With the six of one tool the set of 4 R + 2 P
+        + 6 is complete, minimal and continuous (Zhuang, Roth & Hamano 1992; Okamura & Park 1996)."""
         return [(i, c) for i in range(len(self)) for c in ((0, 1) if self.prismatic[i] else (0, 1, 3, 4))]
 
     def moved(self, step: np.ndarray) -> "Chain":

@@ -184,12 +184,10 @@ def covariance_of_likelihood(
     plausible: float,
 ) -> tuple[np.ndarray, float]:
     """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image, infinite if that does not
-    matter: it does if its excess is below ``plausible``, and it is some σ away and far more probable than these say.
-
-    If the likelihood is not Gaussian, the covariance is its second moment, by importance sampling with fixed numbers
+    matter: it does if its excess is below ``plausible``, and it is some σ away and far more probable than these say. If
+    the likelihood is not Gaussian, the covariance is its second moment, by importance sampling with fixed numbers
     (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4), without poses nearer to the ``second``
-    solution. ``full``: (2n, 2n) of the centres; ``least``: χ² of the pose; ``covariance``: (6, 6), linearised.
-    """
+    solution. ``full``: (2n, 2n) of the centres; ``least``: χ² of the pose; ``covariance``: (6, 6), linearised."""
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
