@@ -16,7 +16,7 @@ from stcal.boards.target_file import load_boards, load_target
 from stcal.design import StatedSize
 from stcal.errors import InputNote, StcalError
 from stcal.handeye.data.pose_content import Said
-from stcal.handeye.data.pose_files import read_pairs, read_side
+from stcal.handeye.data.pose_files import read_pairs, read_robot
 from stcal.io.files import text_of
 from stcal.io.table import POSE, read_table
 from stcal.locate.layout import load_plan
@@ -59,7 +59,7 @@ def rows_of(load: Callable[[Path], Robot]) -> Callable[[Path], np.ndarray]:
 
 
 def of_robot_poses(path: Path) -> np.ndarray:
-    poses = read_side(path, "robot", Said())[0].poses
+    poses = read_robot(path, Said()).poses
     return np.hstack([poses.translation, poses.rotation.reshape(-1, 9)])
 
 
