@@ -223,8 +223,16 @@ def _faces(
             places.setdefault(face.face, {}).setdefault(label.circle, []).append(xyz)
     known = {face: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face, centres in places.items()}
     if any(notes for _, notes in results):
-        results = [chain.faces_of_group(model, camera, target, options.frame, known) for model in models]
+        design = {face.id: dict(zip(face.ids, face.places_mm(face.ids), strict=True)) for face in target.faces}
+        results = [chain.faces_of_group(model, camera, target, options.frame, design | known) for model in models]
     faces, notes = ([each for parts in of_kind for each in parts] for of_kind in zip(*results, strict=True))
+    mapped = {label for model in models for label in model.labels}
+    for face in (target.face(face_id) for face_id in sorted({each.face for each in faces} - known.keys())):
+        if unseen := chain.unmapped(face, [label.circle for label in face.labels() if label in mapped]):
+            names = ", ".join(f"{face.id}:{circle}" for circle in unseen)
+            place = "it stands where the design has it against the face's other circles"
+            doubt = "and σ carries how far circles are off the design"
+            notes.append(f"face {face.id}: frame circle {names} not mapped; {place}, {doubt}")
     return faces, notes
 
 

@@ -1,7 +1,8 @@
 """Face frames from circle centres, the faces of each group, and their chaining into the target frame."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -44,13 +45,19 @@ class FaceInGroup:
         freeze(self, "information", (n, 3, 3), "information")
 
 
+def unmapped(face: FaceDesign, circles: Collection[str]) -> tuple[str, ...]:
+    """Returns the circles of the face's frame that are not mapped; none for a face of known shape."""
+    corners = () if face.sigma_mm is not None else (face.origin, face.x, face.y)
+    return tuple(circle for circle in corners if circle not in circles)
+
+
 def with_known(
     face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Returns the circles (3,) by id, with frame circles that are not mapped by a rigid fit to ``known`` places."""
-    missing = [c for c in (face.origin, face.x, face.y) if c in known and c not in xyz]
+    missing = [c for c in unmapped(face, xyz) if c in known]
     common = [c for c in xyz if c in known]
-    if face.sigma_mm is not None or not missing or len(common) < MIN_PLACING:
+    if not missing or len(common) < MIN_PLACING:
         return dict(xyz)
     try:
         model_from_known = align_rigid(np.array([xyz[c] for c in common]), np.array([known[c] for c in common]))
@@ -67,16 +74,26 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 
 
 def face_frames(
-    face: FaceDesign, circles: Sequence[str], xyz: np.ndarray, kind: FrameKind, towards: np.ndarray
+    face: FaceDesign,
+    circles: Sequence[str],
+    xyz: np.ndarray,
+    kind: FrameKind,
+    towards: np.ndarray,
+    shifts: np.ndarray | None = None,
 ) -> Poses:
     """Returns :func:`face_frame` of k sets of centres, (k, n, 3). The frame of a face of known shape is that of the
-    design, laid over all of its points by least squares."""
+    design, laid over all of its points by least squares; this also places the p frame circles that are not mapped, if
+    they have ``shifts`` (k, p, 3), mm, against the design."""
     if face.sigma_mm is not None:
         return _fitted(face, circles, xyz)
-    if missing := [circle for circle in (face.origin, face.x, face.y) if circle not in circles]:
-        names = " and ".join(f"{face.id}:{circle}" for circle in missing)
-        words = f"face {face.id}: frame circle {names} not mapped; add views that show it"
-        raise DegenerateError("E-FACE-FRAME-CIRCLES", words)
+    if missing := unmapped(face, circles):
+        if shifts is None:
+            names = " and ".join(f"{face.id}:{circle}" for circle in missing)
+            words = f"face {face.id}: frame circle {names} not mapped; add views that show it"
+            raise DegenerateError("E-FACE-FRAME-CIRCLES", words)
+        design = _fitted(face, circles, xyz)
+        placed = np.einsum("kij,kpj->kpi", design.rotation, face.places_mm(missing) + shifts)
+        circles, xyz = (*circles, *missing), np.concatenate([xyz, placed + design.translation[:, None]], axis=1)
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_plane(xyz, towards)
@@ -91,6 +108,19 @@ def face_frames(
         )
     axis_y = across / length
     return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)
+
+
+def off_design_mm(target: TargetDesign, labels: Sequence[CircleLabel], xyz: np.ndarray) -> float:
+    """Returns the in-plane σ per axis of circles (c, 3) about the design, pooled over fits of the faces."""
+    square, redundancy = 0.0, 0
+    for face in target.faces:
+        rows = [i for i, label in enumerate(labels) if label.face == face.id]
+        circles = [labels[i].circle for i in rows]
+        with suppress(DegenerateError):
+            away = _fitted(face, circles, xyz[None, rows])[0].inverse() @ xyz[rows] - face.places_mm(circles)
+            square += float((away[:, :2] ** 2).sum())
+            redundancy += 2 * len(rows) - 3
+    return float(np.sqrt(square / redundancy)) if redundancy else 0.0
 
 
 def _fitted(face: FaceDesign, circles: Sequence[str], xyz: np.ndarray) -> Poses:
@@ -112,7 +142,7 @@ def faces_of_group(
     known: Mapping[str, Mapping[str, np.ndarray]] | None = None,
 ) -> tuple[list[FaceInGroup], list[str]]:
     """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles that it
-    lacks are placed by those that it has, where other groups know both: ``known``, by face and circle."""
+    lacks are placed by those that it has, as other groups or the design have both: ``known``, by face and circle."""
     xyz = model.xyz_model
     by_point = model.whiten(projection_jacobians(model, camera)[1])
     information = np.zeros((len(model.labels), 3, 3))  # inverse covariance of each point, given the cameras, mm⁻²

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stcal.design import TargetDesign
 from stcal.geometry.arrays import rms
@@ -25,21 +26,32 @@ class Derivatives:
     target_from_face: dict[str, Rigid]
     xyz_target: np.ndarray  # (c, 3)
     target_from_model: Rigid
-    faces: dict[str, np.ndarray]  # by face, (6, 3c) rad and mm, perturbation in the target frame
-    circles: np.ndarray  # (c, 3, 3c)
+    faces: dict[str, np.ndarray]  # by face, (6, 3c + d) rad and mm, perturbation in the target frame
+    circles: np.ndarray  # (c, 3, 3c + d), d in-plane places by the design of frame circles that were not mapped
+    design_sigma_mm: float  # of these
+
+    def whole(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """Returns the covariance (3c + d, 3c + d) of circles and places by the design."""
+        designed = self.circles.shape[2] - len(covariance_mm2)
+        return block_diag(covariance_mm2, self.design_sigma_mm**2 * np.eye(designed)) if designed else covariance_mm2
+
+    def by_circles(self) -> dict[str, np.ndarray]:
+        """Returns the derivatives (6, 3c) of the faces by the circles alone."""
+        return {face: own[:, : 3 * len(self.circles)] for face, own in self.faces.items()}
 
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """Returns 6×6 by face from the covariance (3c, 3c) of the circles, in any datum."""
-        return {face: own @ covariance_mm2 @ own.T for face, own in self.faces.items()}
+        whole = self.whole(covariance_mm2)
+        return {face: own @ whole @ own.T for face, own in self.faces.items()}
 
     def distance_sigma_mm(self, covariance_mm2: np.ndarray) -> dict[tuple[str, str], float]:
         """Returns σ of the distance between the origins of every two faces."""
-        sigma = {}
+        sigma, whole = {}, self.whole(covariance_mm2)
         for a, b in combinations(self.target_from_face, 2):
             offset = self.target_from_face[b].translation - self.target_from_face[a].translation
             along = offset / np.linalg.norm(offset)
             apart = along @ (self.faces[b][3:] - self.faces[a][3:])
-            sigma[a, b] = float(np.sqrt(max(apart @ covariance_mm2 @ apart, 0.0)))
+            sigma[a, b] = float(np.sqrt(max(apart @ whole @ apart, 0.0)))
         return sigma
 
     def circle_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
@@ -50,7 +62,7 @@ class Derivatives:
     def all_circles_covariance(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """Returns (3c, 3c) mm², target frame, of all circles together; singular, since they carry the frame."""
         by_circles = self.circles.reshape(3 * len(self.circles), -1)
-        return by_circles @ covariance_mm2 @ by_circles.T
+        return by_circles @ self.whole(covariance_mm2) @ by_circles.T
 
 
 def calibrated_target(
@@ -64,7 +76,7 @@ def calibrated_target(
     own = derivatives(result, start, target, kind)
     sources: dict[str, dict[str, np.ndarray]] = {}  # by face and kind of observation, part of σ of x, y, z, mm
     if state:
-        positions = np.concatenate([jacobian[3:] for jacobian in own.faces.values()])
+        positions = np.concatenate([jacobian[3:] for jacobian in own.by_circles().values()])
         variances = {
             kind: np.maximum(np.diag(matrix), 0.0) for kind, matrix in _parts_of(state, positions.T)[0].items()
         }
@@ -93,34 +105,43 @@ def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
 
 def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Derivatives:
     """Computes the derivatives of poses and circles in the target frame by all circles, by central differences."""
-    width = 3 * len(result.labels)
+    mapped = width = 3 * len(result.labels)
     poses: dict[str, Rigid] = {}
-    by_model: dict[str, np.ndarray] = {}  # (6, 3c) of model_from_face
+    parts: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # columns, and derivatives of model_from_face by these
     for face in target.faces:
         if face.id not in start.target_from_face:
             continue
         rows = np.array([i for i, label in enumerate(result.labels) if label.face == face.id], int)
         names, towards = tuple(result.labels[i].circle for i in rows), start.target_from_face[face.id].rotation[:, 2]
-        xyz, moves = result.xyz_model[rows], STEP_MM * np.eye(3 * len(rows)).reshape(3 * len(rows), len(rows), 3)
-        places = [xyz[None], xyz + moves, xyz - moves]
-        place, ahead, behind = (chain.face_frames(face, names, each, kind, towards) for each in places)
-        poses[face.id], by_model[face.id] = place[0], np.zeros((6, width))
-        by_model[face.id][:, equations.coordinates(rows)] = ahead.difference(behind).T / (2 * STEP_MM)
+        m, p = 3 * len(rows), len(chain.unmapped(face, names))
+        moves, shifts = np.eye(m + 2 * p, m).reshape(m + 2 * p, len(rows), 3), np.zeros((m + 2 * p, p, 3))
+        shifts[m:, :, :2] = np.eye(2 * p).reshape(2 * p, p, 2)
+        place, ahead, behind = (
+            chain.face_frames(face, names, result.xyz_model[rows] + h * moves, kind, towards, h * shifts)
+            for h in (0, STEP_MM, -STEP_MM)
+        )
+        columns = np.append(equations.coordinates(rows), width + np.arange(2 * p))
+        poses[face.id], parts[face.id] = place[0], (columns, ahead.difference(behind).T / (2 * STEP_MM))
+        width += 2 * p
+    by_model = {face_id: np.zeros((6, width)) for face_id in poses}
+    for face_id, (columns, own) in parts.items():
+        by_model[face_id][:, columns] = own
     target_from_model = poses[start.reference_face].inverse()
     frame, origin, turn = by_model[start.reference_face], poses[start.reference_face], target_from_model.rotation
 
     def in_target(place: np.ndarray, move: np.ndarray) -> np.ndarray:
-        """Returns how a place (3,) changes in the target frame, which moves too; ``move`` (3, 3c) in the model."""
+        """Returns how a place (3,) changes in the target frame, which moves too; ``move`` (3, 3c + d) in the model."""
         return turn @ (move - frame[3:] + skew(place - origin.translation) @ frame[:3])
 
     by_face = {
         face_id: np.vstack([turn @ (by[:3] - frame[:3]), in_target(poses[face_id].translation, by[3:])])
         for face_id, by in by_model.items()
     }
-    moves = np.eye(width).reshape(-1, 3, width)
+    moves = np.eye(mapped, width).reshape(-1, 3, width)
     circles = np.array([in_target(*each) for each in zip(result.xyz_model, moves, strict=True)])
     places = {face_id: target_from_model @ pose for face_id, pose in poses.items()}
-    return Derivatives(places, target_from_model @ result.xyz_model, target_from_model, by_face, circles)
+    sigma = chain.off_design_mm(target, result.labels, result.xyz_model) if width > mapped else 0.0
+    return Derivatives(places, target_from_model @ result.xyz_model, target_from_model, by_face, circles, sigma)
 
 
 FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES = "flatness", "intrinsics", "print", "sizes", "distances"
@@ -216,7 +237,7 @@ def with_scatter(state: Adjusted, start: CalibratedTarget, target: TargetDesign,
     scatter over what independent errors of pixels would do, as few photographs show a face. A photograph's residuals
     are corrected for its part in the answer (CR2, Bell & McCaffrey 2002)."""
     result = state.result()
-    by_circles = [own for own in derivatives(result, start, target, kind).faces.values() if own.any()]
+    by_circles = [own for own in derivatives(result, start, target, kind).by_circles().values() if own.any()]
     if not by_circles:
         return state
     faces = np.concatenate(by_circles)

@@ -342,7 +342,7 @@ class Measurand:
 
     kind: Kind
     of: tuple[str, ...]  # the face, two faces, or two circles
-    jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
+    jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad; or (r, 3c + d) as of :class:`Derivatives`
     value: float = 0.0  # of an angle, rad, or a distance, mm
 
     def __post_init__(self):
@@ -358,8 +358,9 @@ class Measurand:
         return 1e3 if self.kind in ("position", "distance") else 1e3 * float(np.degrees(1.0))
 
     def covariance(self, source: BudgetSource) -> np.ndarray:
-        """Covariance (r, r) from one source."""
-        return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
+        """Covariance (r, r) from one source, of circles, or of these and of those placed by the design."""
+        n = min(len(source.covariance_mm2), self.jacobian.shape[1])
+        return self.jacobian[:, :n] @ source.covariance_mm2[:n, :n] @ self.jacobian[:, :n].T
 
 
 class Uncertainty(Part):
@@ -459,8 +460,6 @@ def budget(
     rng = np.random.default_rng(0)
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = max(joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models), 1)
-    every = measurands(joint, own, reference_face)
-    rows = tuple((each, Uncertainty.of(each, sources, freedom, rng)) for each in every)
     views = tuple(GroupViews.of(model) for model in joint.models)
     circles, estimated = (
         own.circle_covariance(np.sum([each.covariance_mm2 for each in sources if each.evaluation in kinds], axis=0))
@@ -469,6 +468,11 @@ def budget(
     traces = (np.trace(covariances, axis1=1, axis2=2).tolist() for covariances in (circles, estimated))
     freedoms = np.array([effective_freedom(whole, part, freedom) for whole, part in zip(*traces, strict=True)])
     conditions = conditions_of(statement, board)
+    if own.design_sigma_mm:
+        words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
+        told = "placed_circles", "frame circles placed", "A", "estimated", words, 1e3 * own.design_sigma_mm, "µm"
+        sources += (BudgetSource(*told, own.whole(np.zeros_like(joint.covariance_mm2))),)
+    rows = tuple((each, Uncertainty.of(each, sources, freedom, rng)) for each in measurands(joint, own, reference_face))
     return Budget(joint, reference_face, sources, rows, circles, freedoms, freedom, views, statement, conditions)
 
 

@@ -266,7 +266,7 @@ class PositionsWith:
         now = setup.adjusted(models).extensible()
         faces = known.face_covariance(setup.circle_covariance(now.covariance_mm2))
         variance = {f: position_sigma_mm(c) ** 2 for f, c in faces.items() if f != setup.start.reference_face}
-        jacobian = np.concatenate([known.faces[face][3:] for face in variance])
+        jacobian = np.concatenate([own[3:] for face, own in known.by_circles().items() if face in variance])
         to_positions = {group: covariance @ jacobian.T for group, covariance in now.to_circles.items()}
         return cls(now, variance, to_positions, setup.sigma0**2)
 

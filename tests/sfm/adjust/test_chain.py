@@ -1,4 +1,4 @@
-"""Face frames, also where a group lacks their circles, and their chaining into the target frame."""
+"""Face frames, also where no image shows their circles, and their chaining into the target frame."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import FaceInGroup, chain_faces, face_frame, measure_chains, with_known
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with, refuses
+from tests.support.image_poses import pose_error
 
 TARGET = reference_target()
 FACE = TARGET.face("1")
@@ -118,6 +119,24 @@ def scene():
     """Two groups of five views, half-size camera."""
     pairs = (("1", "2"), ("1", "4"))
     return make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=5, groups=pairs))
+
+
+@pytest.mark.slow
+def test_the_faces_are_as_far_off_as_they_say(scene, labels_only):
+    """Circles are placed with σ 20 µm about the design: σ of the faces grows to that, and covers the error. χ²₆/6 of a
+    true covariance exceeds 4 once in 2000 draws; the placement's own estimate has some 80 degrees of freedom."""
+    whole = calibrated(scene, labels_only, ()).target
+    found = calibrated(scene, labels_only, ("1:1", "1:5", "2:3"))
+    for face_id, pose in found.target.target_from_face.items():
+        if face_id == "1":
+            continue
+        error = pose_error(pose, scene.target_from_face[face_id])
+        covariance = found.target.face_covariance[face_id]
+        assert error @ np.linalg.solve(covariance, error) / 6 < 4
+        own, before = (np.sqrt(np.trace(c[3:, 3:])) for c in (covariance, whole.face_covariance[face_id]))
+        assert 0.005 < own < 0.2
+        assert own > 1.5 * before
+    assert sum("stands where the design has it" in note for note in found.notes) == 2
 
 
 @pytest.mark.parametrize("solve", ["joint", "chain"])
