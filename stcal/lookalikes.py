@@ -75,8 +75,7 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 @kept
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
     """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, as above. Returns
-    places of the same circles in ``xy`` and in ``other_xy`` for each motion, the most circles first. A part of
-    another result is omitted."""
+    their places in ``xy`` and ``other_xy`` for each motion, the most first, no part of another."""
     fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
     found: list[np.ndarray] = []
     known: list[set[tuple[int, int]]] = []

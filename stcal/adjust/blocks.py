@@ -85,9 +85,8 @@ class Components:
         return np.array([own.flat() for own in self.each]), self.fixed.flat(), counted
 
     def at(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """Evaluate the posterior at x (p,), by restricted maximum likelihood (Patterson & Thompson 1971). Return log
-        posterior density, its gradient (p,), the step of the kept unknowns (k,) from the state, and their covariance
-        (k, k)."""
+        """Evaluate the posterior at x (p,), by restricted maximum likelihood (Patterson & Thompson 1971). Return its
+        logarithm, gradient (p,), the step of the kept unknowns (k,) from the state, and their covariance (k, k)."""
         share, (each, fixed, counted) = np.exp(-2 * x), self._flat
         whole = self.fixed.filled(share @ each + fixed)
         normal, right, reduction = whole.alone(self.held)
@@ -160,8 +159,7 @@ def component_variances(
 
 
 def sigma_factor(square: float, redundancy: float) -> float:
-    """Return the factor on σ that makes the sum of squares over σ² equal its redundancy (Förstner 1979); one step of an
-    iteration if other σ are estimated too."""
+    """Return the factor on σ that makes the sum of squares over σ² equal its redundancy (Förstner 1979)."""
     return float(np.sqrt(square / max(redundancy, 1.0)))
 
 

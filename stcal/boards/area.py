@@ -40,8 +40,7 @@ def across_edges(
     grey: np.ndarray, major: np.ndarray, column: np.ndarray, middle: np.ndarray, half: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return levels (m, p, s), places (m, p, s, 2) and whether they are in the image, of pixels across m edges.
-    ``major`` : (m,) 0 for an edge along the rows, whose pixels are taken by columns; ``column``, ``middle`` : (m,
-    p)."""
+    ``major`` : (m,) 0 for an edge along the rows, taken by columns; ``column``, ``middle`` : (m, p)."""
     across = middle[..., None] + np.arange(-half, half + 1)
     along = np.broadcast_to(column[..., None], across.shape)
     by_column = (major == 0)[:, None, None]
@@ -107,8 +106,7 @@ class SamplingVariance:
 
 
 def displacement_variance(told: Displacement) -> SamplingVariance:
-    """Return the variances that explain the estimates best, weighted by their certainty; at least 0. Both have a
-    prior."""
+    """Return the variances that explain the estimates, weighted by certainty, best; at least 0, with a prior."""
     known = np.isfinite(told.square)
     square, noise, passed = told.square[known], told.noise[known], told.passed[known]
     design = np.stack([passed**2, np.ones_like(passed)], axis=-1)

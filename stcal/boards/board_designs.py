@@ -93,8 +93,7 @@ def mean_sides(corners: np.ndarray) -> np.ndarray:
 
 
 def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusual_size: bool, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other. ``corners_mm`` : (n, 4,
-    2), NaN for tags of no known place."""
+    """Refuse tags in another unit than mm, or on each other. ``corners_mm`` : (n, 4, 2), NaN where unknown."""
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), mean_sides(corners_mm[known])
     lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))

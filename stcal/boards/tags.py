@@ -121,8 +121,7 @@ def _inside(place: np.ndarray, other: np.ndarray) -> bool:
 
 def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: str) -> str:
     """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing. Tags
-    of ``own`` may be in view twice, mirrored, or white on black, or of another dictionary, to be corrected in
-    ``place``."""
+    of ``own`` may be in view twice, mirrored, or white on black, or of another dictionary than ``place`` says."""
     grey, known = grey_8bit(image), sorted({name for name, _ in own})
     if twice := [tag for tag in find_tags(grey, known).repeated if tag in own]:
         return f"tag {twice[0][1]} more than once; cover what is not the target, and mirrors"

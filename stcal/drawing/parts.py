@@ -275,8 +275,7 @@ class _Plate:
 
 
 def net_part(target: TargetDesign) -> Piece:
-    """Return the net of all plates: those that share an edge in space, by ``outline_mm`` at rough poses, unfolded into
-    one plane."""
+    """Return the net of all plates: those that share an edge, by ``outline_mm`` at rough poses, unfolded."""
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
             fault = f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}"

@@ -49,8 +49,7 @@ class Plane(NamedTuple):
 
 
 def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
-    """Return the total-least-squares plane of n ≥ 3 points (..., n, 3) off a line, its normal on the side of
-    ``towards``."""
+    """Return the total-least-squares plane of n ≥ 3 points (..., n, 3) off a line, its normal ``towards`` a side."""
     xyz = np.asarray(xyz, float)
     n = xyz.shape[-2]
     if n < 3:

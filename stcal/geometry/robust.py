@@ -25,10 +25,9 @@ TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
 
 
 def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
-    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a
-    sample (n,). Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the
-    fewest that the ratio of two quantiles admits, both far below gross errors. ``together`` : number of lengths that
-    share an error."""
+    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a sample
+    (n,). Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the fewest that
+    the ratio of two low quantiles admits. ``together`` : number of lengths that share an error."""
 
     def quantile(exceeded: float, freedom: float) -> float:
         return float(np.sqrt(freedom * np.expm1(-2 / freedom * np.log(exceeded))))

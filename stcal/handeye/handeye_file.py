@@ -208,8 +208,7 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
     """Returns the names of the frames from the root; NAME_link has the child NAME_optical_frame. Empty names: flange or
-    base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`. Raises InputError: a name has a control character, or occurs
-    twice."""
+    base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`. Raises InputError: a control character, or a name twice."""
     link = child or CAMERA_LINK
     below = [child or CAMERA_FRAME] if camera_frame == "optical" else [link, f"{link.removesuffix('_link')}{OPTICAL}"]
     names = [parent or FRAMES[setup].mount, *below]
@@ -256,8 +255,7 @@ def urdf_joint(transforms: list[Static]) -> str:
 
 def easy_handeye(result: HandEye, transforms: list[Static], name: str, second: bool = False) -> str:
     """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye, or, of the ``second`` version, for
-    ROS 2, ``~/.ros2/easy_handeye2/calibrations/NAME.calib``. The frame of the board, and the robot's frame without the
-    camera, are unused."""
+    ROS 2, ``~/.ros2/easy_handeye2/calibrations/NAME.calib``. Frames of board and robot are unused."""
     first, *others = transforms
     frames, in_hand, lines = FRAMES[result.setup], result.setup == "eye-in-hand", said_of(result)
     carries = {frames.mount: first.parent, frames.stand: frames.stand}

@@ -313,9 +313,8 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> Remarks:
 
 
 def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool) -> Remarks:
-    """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
-    jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals, or be beyond
-    chance where the poses are ``apart``."""
+    """Returns a note if camera or board moved or drifted, by residuals (m, 6) of all in order, and their jacobian (m,
+    6, 12). A move must explain most of the residuals, or be beyond chance where the poses are ``apart``."""
     sigma = np.repeat(np.median(np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2), axis=0), 3)
     if not (sigma > 0).all():
         return ()
@@ -380,8 +379,7 @@ on the two seem to be exchanged: a board stands farther from the robot's base th
 
 def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> Remarks:
     """Returns a note if the camera is where no flange carries it, unless the setup was ``stated``, or if X and Z seem
-    to be exchanged. Poses of the other setup, or sides that were exchanged or inverted, fit as well: no residual
-    tells."""
+    to be exchanged. Poses of the other setup, or exchanged or inverted sides, fit as well."""
     away, board = float(np.linalg.norm(x.translation)), float(np.linalg.norm(z.translation))
     exchanged = away > LONG_MM and board < NEARER * away
     if setup != "eye-in-hand" or not (exchanged or (away >= FAR_MM and not stated)):

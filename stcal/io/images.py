@@ -208,9 +208,8 @@ def name_fault(name: str) -> str | None:
 
 
 def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor
-    gave them. Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it
-    is turned as its EXIF says."""
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor gave
+    them. If the camera's ``size`` is given and the image has its sides swapped, it is turned as EXIF says."""
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
     if not ends_properly(data):
@@ -397,9 +396,8 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two grey images are two files of one exposure, of equal noise but for losses by compression.
-    The noise of two exposures from one place differs by √2 times itself. Brightness may differ by a factor and a
-    constant."""
+    """Return True if two grey images are two files of one exposure, of equal noise but for losses by compression. That
+    of two exposures differs by √2 times itself. Brightness may differ by a factor and a constant."""
     if image.shape != other.shape:
         return False
     first, second = (grey_8bit(grey).astype(np.float32) for grey in (image, other))

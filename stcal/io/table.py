@@ -356,9 +356,8 @@ def csv_rows(text: str) -> Iterator[dict[str, Any]]:
 
 
 def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
-    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone;
-    one of the ``comments`` may state the unit of x, y, z. In ``euler_ZYX_1_deg`` the case means turned axes: it stays.
-    """
+    """Return names of columns as the package writes them, where they differ in case or form of the unit alone; one of
+    the ``comments`` may state the unit of x, y, z. In ``euler_ZYX_1_deg`` the case means turned axes: it stays."""
     said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
     units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _LONG[u]))) for word in said}
     unit = units.pop() if len(units) == 1 else ""

@@ -163,8 +163,7 @@ class Problem:
 
     def unit_covariance(self, transform: Transform) -> np.ndarray:
         """Returns the covariance (p, p) of a fit's parameters at unit noise. Parameters of a left perturbation in frame
-        b: rotation vector (rad), translation (mm), and of a similarity the relative scale. Affine: rows of the 3×4
-        matrix."""
+        b: rotation (rad), translation (mm), and the relative scale. Affine: rows of the 3×4 matrix."""
         origin = self._middle()
         normal, motions, shift = self._normal(transform, origin), _motions(self.model, transform), np.eye(4)
         shift[:3, 3] = -origin

@@ -250,8 +250,7 @@ def held_out(
     problem: Problem, fit_rows: Callable[[np.ndarray], Transform], inliers: np.ndarray, folds: int, seed: int
 ) -> HeldOutPoints | None:
     """Returns the errors of points left out of the fit in turn; None if too few are left, or every fold fails.
-    ``fit_rows`` : fit to given rows; ``inliers`` : (n,) of the fit to all; ``folds`` : number of parts to leave out;
-    ``seed`` : of the division."""
+    ``fit_rows`` : fit to given rows; ``inliers`` : (n,) of the fit to all; ``folds`` : parts; ``seed`` : of these."""
     rng = np.random.default_rng([seed, 2])
     sample = np.sort(rng.permutation(len(problem))[:TRIED])
     parts = [sample[part] for part in dealt(len(sample), folds, rng)]

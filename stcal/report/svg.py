@@ -243,8 +243,7 @@ class Axes:
         self, values: np.ndarray, extent: Box, low: float, high: float, ramp: str, bands: int = 0, smooth: bool = True
     ) -> None:
         """Shades values (rows, columns) in colours of a ramp from low to high; nan stays empty. ``extent`` : x and y of
-        the first and of the last value; ``bands`` : number of steps of the colours, 0 for none; ``smooth`` : whether
-        values are interpolated."""
+        the first and of the last value; ``bands`` : steps of colours, or 0; ``smooth`` : interpolated."""
         from scipy.ndimage import zoom
 
         share = (values - low) / ((high - low) or 1.0)
@@ -266,8 +265,7 @@ class Axes:
         y_ticks: Ticks | None = None,
         size: float = SMALL + 1,
     ) -> None:
-        """Draws left and lower line with ticks (values and words) and the names of the axes; ``grid`` : the axes whose
-        ticks get lines across."""
+        """Draws left and lower line with ticks (values and words) and names of the axes; ``grid`` : axes with lines."""
         drawing, (left, top, right, bottom) = self.drawing, self.box
         x_values, x_texts = x_ticks or self._ticks("x", (right - left) / 45)
         y_values, y_texts = y_ticks or self._ticks("y", (bottom - top) / 22)
@@ -295,8 +293,7 @@ class Axes:
 
 
 def limits(values, margin: float = 0.05, low: float | None = None) -> tuple[float, float]:
-    """Returns limits of an axis that hold all finite values and a margin, a share of their extent; ``low`` : the lower
-    limit, if it is given."""
+    """Returns limits of an axis for all finite values and a margin, a share of their extent; ``low`` : if given."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     first, last = (values.min(), values.max()) if len(values) else (0.0, 1.0)

@@ -242,8 +242,7 @@ FEW = 200  # number of rows beyond which points are drawn small
 def joints_figure(
     state: State, seen: Observed, residuals: np.ndarray, good: np.ndarray, colour: str = COLOURS[0]
 ) -> Drawing:
-    """Returns a figure of residuals (r, w) of good rows (r,), in the world's axes, along each joint's motion by its
-    value."""
+    """Returns a figure of residuals (r, w) of good rows (r,), in the world, along each joint's motion by its value."""
     data, chain, points = seen.data, state.chain, []
     tip, errors = state.tips_of(data), residuals[:, -3:]
     twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]

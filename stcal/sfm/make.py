@@ -280,8 +280,7 @@ class Made:
 
 
 def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
-    """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` is called with (done,
-    total) cases of hidden circles."""
+    """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` : of hidden circles."""
     camera, radius = options.ideal_camera(), options.radius_mm
     least_px, most_px = diameter_limits_px(camera.width * camera.height, EllipseOptions())
     focal_px, farthest_mm = float(np.sqrt(camera.focal.prod())), FARTHER * options.distance_mm

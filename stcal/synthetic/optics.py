@@ -94,10 +94,9 @@ def defocused(
     blur_px: float,  # σ of the Gaussian blur that follows, which decides how many points of the lens are taken
     light: np.ndarray | None = None,  # (h, w) of the disc on the last plane; even if None
 ) -> np.ndarray:
-    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens. Through a
-    point p of the lens each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z), an affine map, 1/Z being
-    linear in the image. The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle
-    of confusion."""
+    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens. Through a point
+    p of the lens each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z), an affine map, 1/Z being linear in
+    the image. Lens distortion is linear across the disc: off by < 1e-3 of the circle of confusion."""
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)
     at_lens, weights = lens.points(widest, blur_px)
     base = np.array(corner_px) - 0.5 + 0.5 / cells  # pixel of the first square
@@ -149,9 +148,8 @@ class Light:
 def expose(
     photograph: np.ndarray, times: Sequence[float], light: Light | None = None, seed: int = 0
 ) -> list[np.ndarray]:
-    """Exposes the scene of an 8-bit photograph (height, width) at other times; time 1 keeps its brightness.
-    Saturated pixels of the photograph are taken to have the light of white. The noise of the exposures is
-    independent."""
+    """Exposes the scene of an 8-bit photograph (height, width) at other times; time 1 keeps its brightness. Saturated
+    pixels of the photograph count as white. The exposures' noise is independent."""
     if photograph.dtype != np.uint8 or photograph.ndim != 2:
         kind = f"{photograph.dtype} of shape {photograph.shape}"
         raise InputError("E-IMAGE-TYPE", f"photograph: {kind}; 8-bit grey needed")

@@ -280,8 +280,7 @@ def check_lens(scene: Scene, lens: ThinLens | None) -> None:
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:
-    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16. The same arguments give
-    the same image."""
+    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16; the same each time."""
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)

@@ -250,8 +250,7 @@ def from_measured(
     wanted: arms.Targets | None = None,
     options: arms.IdentifyOptions | None = None,
 ) -> FromPhotos:
-    """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
-    :func:`robot_from_photos`."""
+    """Perform the steps after measuring, for the table of :func:`read_joints`, as the above."""
     with scratch_folder("photos") as folder:
         written = folder / "poses.csv"
         save(written, pose_report.poses_csv(measured)[0])

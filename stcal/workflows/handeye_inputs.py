@@ -201,8 +201,7 @@ class Files:
         return self._pairs(*self._joined())
 
     def _joined(self) -> tuple[Source, tuple[str, ...]]:
-        """Returns the poses of both files as one source, and notes on rows left out. Two tables of the package's own
-        are joined as tables."""
+        """Returns the poses of both files as one source, own tables joined as tables, and notes on rows left out."""
         first, second = self.source, self.second
         if second is None or not isinstance(first, Path):
             return first, ()

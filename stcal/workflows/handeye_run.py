@@ -140,8 +140,7 @@ def at_offset(given: HandEyeInput, options: HandEyeOptions) -> tuple[HandEyeInpu
 
 @one_thread()
 def lag_tried(problem: HandEyeProblem, timed: Timed | None, result: HandEye) -> tuple[HandEye, tuple[str, ...]]:
-    """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
-    with the lag goes."""
+    """Returns the result and a note if clocks that differ explain its residuals; a doubt of size that it ends goes."""
     pairs, setup, options = problem.pairs, problem.setup, problem.options
     if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _is_moving(timed):
         return result, ()

@@ -438,8 +438,7 @@ def _no_poses(table: Table) -> InputError:
 
 
 def settled(content: PoseContent, role: Role, path: Path, statements: Said) -> PoseSide:
-    """Returns poses of a role, or of the only side where nothing states its role, in the direction that is needed, mm,
-    with a line on how they were read."""
+    """Returns poses of a role, or of the only side, in the direction that is needed, mm, and how they were read."""
     wanted, first, statements = SIDES[role][0], content.sides[0], statements.of(role)
     side = content.of(role) or (first if len(content.sides) == 1 and first.frames is None else None)
     if side is None:

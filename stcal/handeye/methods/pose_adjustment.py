@@ -83,8 +83,7 @@ class LoopComponents:
         return self.known + np.tensordot(variances, self.free, 1)
 
     def first(self, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect, and
-        their lower limits."""
+        """Returns first variances (f,) from the medians of residuals (m, 6), and their lower limits."""
         turn, shift = (robust_sigma(each, 3) ** 2 for each in np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2).T)
         kinds = [name.rpartition("_")[2] for name in self.names]
         by_kind = {"rad": turn / max(kinds.count("rad"), 1), "mm": shift, "factor": 1.0}

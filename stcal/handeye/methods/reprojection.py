@@ -328,8 +328,7 @@ def of_poses(solution: PoseSolution, views: Views, prior: CameraPrior, inverse: 
 
 def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Returns the second moment (q, q) of the intrinsics' error: squared estimate plus covariance. Where corners
-    contradict what is ``known`` (q, q), its σ are widened by kind, by maximum likelihood (EM: Dempster, Laird & Rubin
-    1977)."""
+    contradict what is ``known`` (q, q), its σ are widened by kind, by EM (Dempster, Laird & Rubin 1977)."""
     parts = [rows for _, rows in camera_parts(basis, known)]
     squared = np.ones(len(parts))
     for _ in range(ROUNDS):

@@ -146,8 +146,7 @@ def length_of(data: Measurements) -> float | None:
 
 
 def ring(length_mm: float) -> np.ndarray:
-    """Returns places (3, 3) at ``length_mm`` about the target's origin, in its XY plane; raises InputError: a length
-    out of range."""
+    """Returns places (3, 3) at ``length_mm`` about the target's origin, in its XY plane; InputError if out of range."""
     if not SHORTEST_MM <= length_mm <= LONGEST_MM:
         needed = f"{SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
         raise InputError("E-OPTION-RANGE", f"--orientations {length_mm:g}: {needed}")
@@ -156,8 +155,7 @@ def ring(length_mm: float) -> np.ndarray:
 
 
 def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
-    """Returns reflectors carried at ``places`` (k, 3) of a target, mm; raises InputError if there are no
-    orientations."""
+    """Returns reflectors carried at ``places`` (k, 3) of a target, mm; InputError without orientations."""
     m, k, rotations = len(data), len(places), data.poses().rotation
     about = places - places.mean(axis=0)
     lever = about / np.sqrt((about**2).sum(axis=1).mean())
@@ -301,8 +299,7 @@ class AxisFit:
         return turn, np.einsum("mij,mj->mi", turn, points - origin) + origin
 
     def solved(self, moved: np.ndarray | None) -> "AxisFit":
-        """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) values of the joint, None
-        if the axis is known nearly."""
+        """Returns the fit by iterated Huber weights, without gross errors; ``moved`` : (m,) joint values, if needed."""
         if self.redundancy < 1:
             few = f"{len(self.rows)} positions on {len(self.used)} arcs leave no redundancy"
             self._undetermined(f"{few}; another position or a second reflector needed", "E-AXES-FEW")

@@ -209,8 +209,7 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 
 
 def frame_motions(xyz: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Returns the motions (m, 6, 6) of tools at (m, 3) with the world, by its small rotations about ``centre`` and
-    shifts."""
+    """Returns the motions (m, 6, 6) of tools at (m, 3) by small rotations of the world about ``centre`` and shifts."""
     moves = np.zeros((len(xyz), 6, 6))
     moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
     moves[:, 3:, :3] = -skew(xyz - centre)

@@ -49,9 +49,8 @@ AROUND = 0.1
 
 
 def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
-    """Returns the nominal chain, with base and tools that fit best, or as given if not in ``fit``. Raises
-    InputError: the robot does not fit; names a cause that does. Raises DegenerateError: a target never moved, or
-    only along a line."""
+    """Returns the nominal chain, with base and tools that fit best, or as given if not in ``fit``. Raises InputError:
+    the robot does not fit; names a cause that does. Raises DegenerateError: a target moved on a line at most."""
     if data.positions is not None and len(set(data.stations)) > 1:
         return _with_stations(robot, data, fit)
     named = sorted(set(data.targets))

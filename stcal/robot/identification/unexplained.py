@@ -56,9 +56,8 @@ def left(
     weights: np.ndarray | None = None,
 ) -> tuple[Effect, ...] | None:
     """Returns the effects found in the residuals of ``state``, at most three, the strongest first; None for too few
-    rows. Along the order of the rows, a jump or drift is tried with all rows, since half of them may seem to be errors.
-    ``explained`` : (r, w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are
-    left out."""
+    rows. Along the order of the rows, a jump or drift is tried with all rows: half may seem errors. ``explained`` : (r,
+    w, k) derivatives by the fitted parameters, all if None; ``weights`` : (r,), those below 0.5 are left out."""
     explained = state.jacobian(measured) if explained is None else explained
     explained = np.concatenate([explained, _shared(state, measured)], axis=2)
     errors, white = state.residuals(measured), partial(weighting.whiten, measured=measured)
@@ -141,8 +140,7 @@ class _Rest:
         return cls(errors, root, weighted, before, fitted, before - fitted @ (fitted.T @ before), freedom)
 
     def strongest(self, candidates: list[_Effect], others: int, square: float) -> _Found | None:
-        """Returns the candidate that explains most beyond chance; ``others`` : number of further tests; ``square`` : of
-        what remained at first."""
+        """Returns what explains most beyond chance; ``others`` : further tests; ``square`` : of the first residuals."""
         if self.freedom < LEAST_FREEDOM:
             return None
         tried = [(each, test) for each in candidates if (test := self._tested(self.weighted(each.motions)))]

@@ -230,9 +230,8 @@ def _faces(
     for face in (target.face(face_id) for face_id in sorted({each.face for each in faces} - known.keys())):
         if unseen := chain.unmapped(face, [label.circle for label in face.labels() if label in mapped]):
             names = ", ".join(f"{face.id}:{circle}" for circle in unseen)
-            place = "it stands where the design has it against the face's other circles"
-            doubt = "and σ carries how far circles are off the design"
-            notes.append(f"face {face.id}: frame circle {names} not mapped; {place}, {doubt}")
+            place = "it stands where the design has it, and σ carries how far circles are off the design"
+            notes.append(f"face {face.id}: frame circle {names} not mapped; {place}")
     return faces, notes
 
 

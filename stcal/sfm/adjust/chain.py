@@ -68,8 +68,7 @@ def with_known(
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
     """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10). ``kind``:
-    ``three-point`` as in the paper; ``plane``: Z from the plane of all circles; ``towards``: direction to the side from
-    which the face is seen."""
+    ``three-point`` as there; ``plane``: Z from the plane of all circles; ``towards``: from where the face is seen."""
     return face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)[0]
 
 
@@ -219,8 +218,7 @@ def chain_faces(
     faces: Sequence[FaceInGroup], target: TargetDesign, reference: str, singly: bool = False
 ) -> CalibratedTarget:
     """Combines the faces of all groups into the frame of the reference face by weighted least squares; ``singly``: each
-    along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they belong), with the circles of its last group.
-    """
+    along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they belong), circles as of its last group."""
     target.face(reference)
     mapped = {face.face for face in faces}
     if reference not in mapped:

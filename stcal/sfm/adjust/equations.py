@@ -255,8 +255,7 @@ class KnownShape:
         size_sigma: float,
         amplitude: float,
     ) -> "KnownShape":
-        """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size; ``amplitude`` : of the
-        smooth deviations of its print."""
+        """Lays the design (n, 3) over points; ``size_sigma`` : relative; ``amplitude`` : of its smooth deviations."""
         modes = PrintModes.of(design[:, :2])
         unit = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
         smooth = -modes.modes.reshape(len(xyz), 3, -1)
@@ -368,8 +367,7 @@ def coordinates(members: np.ndarray) -> np.ndarray:
 
 
 def planes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
-    """Yields the distances of the circles of each face of more than three from their best plane; not of faces of known
-    shape."""
+    """Yields the distances of the circles of each face from their best plane; not of three, or of known shape."""
     if not np.isfinite(setting.flatness_mm):
         return
     known = {face.id for face in faces_of_known_shape(setting.board)}

@@ -139,8 +139,7 @@ class FacesFile(ResultFile):
         rim_mm: Mapping[CircleLabel, float] | None = None,
         doubted: str = "",
     ) -> "FacesFile":
-        """File of a calibrated target, with covariances if it states them, rims behind which it lies, and why not to
-        use it."""
+        """File of a calibrated target, with covariances if stated, rims before it, and why not to use it."""
         radius = design.radius_of()
         content: dict[str, Any] = {
             "format": "stcal faces 1",

@@ -72,8 +72,7 @@ class JointResult:
 
     @property
     def sigma_scale(self) -> float:
-        """Factor in the covariances: ``enlarged`` times σ₀, which counts as 1 at least, as the single groups have
-        confirmed the σ of the centres."""
+        """Factor in the covariances: ``enlarged`` times σ₀, 1 at least, as groups confirmed the centres' σ."""
         return self.enlarged * max(1.0, self.sigma0)
 
     def with_larger_sigma(self, factor: float) -> "JointResult":

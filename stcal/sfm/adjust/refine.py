@@ -200,8 +200,7 @@ def reproject(
     basis: np.ndarray = NO_PARAMETERS,  # (16, q) derivative of the camera's parameters by them
     **known: Any,  # kind, cluster and loss of the rows
 ) -> None:
-    """Adds the rows of a model's observations, projected minus measured centres, px; infinite where a point lies behind
-    its camera."""
+    """Adds the rows of a model's observations, projected minus measured centres, px; infinite behind a camera."""
     point, image, measured_px = model.point_index, model.image_index, model.corrected_px()
 
     @lru_cache(maxsize=2)

@@ -63,8 +63,7 @@ def radius_views(
     model: GroupModel, images: Mapping[str, ImageObservations], design_mm: Mapping[Label, float], camera: Camera
 ) -> RadiusViews:
     """Returns the radii from areas of ellipses, by the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3)
-    of the planes of the faces. A blur of σ reduces a disc's radius R by σ²/2R, and the fitted one by about as much:
-    corrected."""
+    of the planes of the faces. A blur of σ reduces a disc's radius R by σ²/2R, and the fitted one alike: corrected."""
     focal = float(np.sqrt(camera.focal.prod()))
     rows = model.rows_by_image()
     order = np.concatenate(rows)

@@ -59,8 +59,7 @@ class LengthTest:
 
     @classmethod
     def of(cls, reference: str, lengths: Sequence[TestedLength], notes: tuple[str, ...]) -> "LengthTest":
-        """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
-        chance (Bonferroni)."""
+        """Returns the test. The limit of the largest E_n is 1 for one length, more for many (Bonferroni)."""
         count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
         limit = float(-ndtri(combine.BY_CHANCE / 2 / count) / combine.COVERAGE_FACTOR)
         if not e_n:

@@ -20,8 +20,7 @@ LIMITS = 0.05  # share of the variance above which a source is among those that 
 
 
 def budget_report(file: BudgetFile) -> Document:
-    """Returns the report of ``budget``: a certificate if all is stated that it needs, else the budget alone, with what
-    is missing."""
+    """Returns the report of ``budget``: a certificate if all is stated, else the budget alone, with what is missing."""
     if certifies(file):
         return certificate(file)
     given = [[FIELDS.get(name, name), value] for name, value in file.fields.items() if value and name != "number"]

@@ -324,8 +324,7 @@ PARALLEL = 1e-3
 
 
 def coverage_factor(freedom: float) -> float:
-    """Returns k for effective degrees of freedom: of Student's distribution, for the coverage that 2 has of a normal
-    one, 95.45 % (JCGM 100, G.3)."""
+    """Returns k for effective degrees of freedom: Student's, for the coverage 95.45 % (JCGM 100, G.3)."""
     return float(-stdtrit(freedom, BY_CHANCE / 2)) if np.isfinite(freedom) else COVERAGE_FACTOR
 
 

@@ -393,8 +393,7 @@ def calibrated(
 
 
 def views_of_dots(detection: DetectionResult, board: BoardDesign, camera: Camera, first: bool) -> Found:
-    """Returns the views of the board in detected images, sharp but in the ``first`` round, in which depths are
-    unknown, and what was skipped."""
+    """Returns the views of the board in detected images, sharp but in the ``first`` round, and what was skipped."""
     views = intrinsics.board_views(detection.images, board, camera)
     if not first:
         views, _ = correct_defocus(views, camera, pattern_of_board(board))

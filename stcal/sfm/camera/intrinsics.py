@@ -345,8 +345,7 @@ def model_parameters(camera: Camera, colmap_model: str) -> np.ndarray:
 
 def vague_prior(camera: Camera, colmap_model: str) -> np.ndarray:
     """Returns the covariance (q, q) of a prior that any lens fulfils, for a regular normal matrix: focal length 100 %,
-    principal point a quarter of the side; distortion moves the corner by its distance from the middle (tangential: a
-    tenth)."""
+    principal point a quarter of the side; distortion takes corners to the middle (tangential: a tenth)."""
     side = max(camera.width, camera.height)
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
     radial = reach ** -np.array([2.0, 4, 6])

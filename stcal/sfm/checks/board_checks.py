@@ -188,8 +188,7 @@ def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redun
 
 
 def pitch_check(evidence: Evidence) -> Check:
-    """Tests the size of the target, by the positions of its circles, against its design, with its own σ of 100 ppm: no
-    residual shows a wrong pitch."""
+    """Tests the size of the targetagainst its design, with σ of 100 ppm: no residual shows a wrong pitch."""
     calibrated, target = evidence.calibration.target, evidence.target
     if target.up_to_scale:
         return impossible("pitch", "the drawing defines the size", "state a known distance with scale")
@@ -225,8 +224,7 @@ MOST_PRINT_FACTOR = 10.0
 
 
 def scales_check(evidence: Evidence) -> Check | tuple[()]:
-    """Tests each source of the scale against the mean of all in the free network of a group, which has one scale, if
-    the target tells its size too."""
+    """Tests the sources of the scale against their mean in a group's free network, if the target tells its size too."""
     networks, board, joint = evidence.networks, evidence.board, evidence.joint
     if not isinstance(board, ScaleReference):
         return ()

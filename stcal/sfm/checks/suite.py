@@ -246,8 +246,7 @@ OTHER_SIZE = 0.02
 def cause_of_size(
     circles: Mapping[CircleLabel, np.ndarray], design: TargetDesign, board: BoardDesign | None
 ) -> Check | None:
-    """Returns a failed check that names another size of the board than the drawing of the faces has; None if it fits.
-    ``circles`` : (3,) places found, mm."""
+    """Returns a failed check that names another size of the board than the faces' drawing has, if it does not fit."""
     if board is None or not board.rows:
         return None
     ratios = []

@@ -318,8 +318,7 @@ at one place against each face, for images to be labelled with it."""
 def read_groups(
     groups: Sequence[Sequence[Named]], target: TargetDesign, board: BoardDesign | None
 ) -> tuple[list[list[list[Readings]]], BoardDesign | None]:
-    """Returns the readings of each image of each group, none of a mirrored one, and the board in the size in which they
-    have it."""
+    """Returns the readings of each image of each group, none of a mirrored one, and the board in their size."""
 
     def readings(board: BoardDesign | None) -> list[list[list[Readings]]]:
         return [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]

@@ -219,8 +219,7 @@ def adjusted_planes(
 ) -> tuple[Poses, Poses]:
     """Adjusts the poses camera_from_world of images and world_from_plane of planes, of which the first is fixed, to n
     points: ``image``, ``plane`` (n,); ``xyz`` (n, 3) in the plane; ``seen`` (n, 2) measured, ideal px. Without
-    convergence the last state is returned, and the start where a point lies behind its camera: predictions are
-    verified anyway."""
+    convergence the last state is returned, or the start if a point is behind its camera: predictions are verified."""
 
     def off(planes: Poses, cameras: Poses) -> np.ndarray:
         xyz_camera = cameras[image] @ (planes[plane] @ xyz)

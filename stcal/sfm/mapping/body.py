@@ -442,8 +442,7 @@ def plain_lens(camera: Camera) -> Camera:
 
 
 def unknown_lens(camera: Camera, share: float = 1.0) -> Camera:
-    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values; ``share`` : factor on
-    the σ of distortion and principal point."""
+    """Returns a camera with the weak prior of an unknown lens; ``share`` : factor on σ of all but the focal length."""
     side, focal = max(camera.width, camera.height), float(camera.focal.mean())
     reach = float(np.hypot(camera.width, camera.height) / 2 / focal)
     radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach

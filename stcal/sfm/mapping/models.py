@@ -297,8 +297,7 @@ def _labelled_points(reconstruction: pycolmap.Reconstruction, observations: dict
 def points_by_votes(
     observations: Sequence[ImageObservations], images: Sequence[pycolmap.Image], known: Collection[int] | None = None
 ) -> tuple[dict[Label, int], int]:
-    """Returns by label the point, of the ``known`` ones, that most keypoints of it name, and the number of labels with
-    several."""
+    """Returns by label the point (of the ``known``) that most keypoints name, and the number of labels with several."""
     votes_of_label: dict[Label, Counter[int]] = {}
     for observed, image in zip(observations, images, strict=True):
         for label, point in zip(observed.labels, image.points2D, strict=True):

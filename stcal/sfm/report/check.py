@@ -140,8 +140,7 @@ def ranked(checks: Sequence[Check], images: Collection[str]) -> list[Check]:
 
 
 def count_verdicts(checks: Iterable[Check]) -> str:
-    """Number of checks by verdict, the worst first; one that does not apply is counted as such, and the cause that all
-    photographs have in common is none."""
+    """Number of checks by verdict, the worst first; the cause that all photographs have in common is none."""
     told = [check.told() for check in checks if check.key != CAUSE]
     return ", ".join(f"{told.count(v)} {v}" for v in (*ORDER, NOT_APPLICABLE) if v in told) or "none"
 

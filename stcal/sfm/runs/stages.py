@@ -375,8 +375,7 @@ class _Group:
 
 
 def _solve_groups(task: Task, groups: Groups, names: Collection[str]) -> tuple[dict[str, GroupSolution], list[str]]:
-    """Maps and refines group by group, or takes up what an earlier run has kept; returns solutions, and notes on
-    others."""
+    """Maps and refines each group, or takes up what an earlier run kept; returns solutions, and notes on others."""
     images, options, graph = groups.observations, groups.options, groups.graph
     inputs = {}
     for name, of_group in by_group(images).items():
