@@ -10,7 +10,7 @@ from stcal.handeye.handeye_pipeline import Outcome, judged
 from stcal.handeye.handeye_problem import FACTORS, HandEye
 from stcal.handeye.remarks import Aside, spoken
 from stcal.handeye.validate import HeldOutMotions, as_adjusted, poses_by_robot
-from stcal.report.camera_figures import mean_residuals_figure, shown
+from stcal.report.camera_figures import mean_residuals_figure, means_of_cells, shown
 from stcal.report.document import (
     Block,
     Document,
@@ -25,6 +25,7 @@ from stcal.report.document import (
     macro,
     page_only,
     plot,
+    plots,
     subheading,
     tiles,
     verdict_word,
@@ -220,20 +221,12 @@ def _coverage(outcome: Outcome) -> list[Block]:
         measured, by = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)]), "the adjustment"
         residuals = board.residuals_px
     size, finite = (views.camera.width, views.camera.height), np.isfinite(residuals).all(1)
-    across, down = np.clip((measured[finite] / size * CELLS).astype(int), 0, np.array(CELLS) - 1).T
-    cell, cells = across * CELLS[1] + down, CELLS[0] * CELLS[1]
-    count = np.bincount(cell, minlength=cells)
-    total = np.column_stack([np.bincount(cell, each, cells) for each in residuals[finite].T])
-    mean = total / np.maximum(count, 1)[:, None]
+    mean, count = means_of_cells(measured[finite], residuals[finite], CELLS, size)
+    said = f"Mean residuals by {by} in cells of the image, and numbers of corners"
     return [
         f"Corners were seen in {(count > 0).mean():.0%} of the cells of the image. Where they never were, nothing "
         "checks the distortion of the lens",
-        plot(
-            lambda: mean_residuals_figure(mean, count, CELLS, size),
-            "coverage of the image",
-            f"Mean residuals by {by} in cells of the image, and numbers of corners",
-            "",
-        ),
+        plots(plot(lambda: mean_residuals_figure(mean, count, CELLS, size), said, css="")),
     ]
 
 

@@ -113,6 +113,16 @@ def field_figure(pixels: np.ndarray, moved: np.ndarray, what: str = "moved by th
 LEAST = 5  # number of residuals in a cell whose mean is drawn
 
 
+def means_of_cells(
+    xy_px: np.ndarray, residuals_px: np.ndarray, cells: tuple[int, int], size_px: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return means (c, 2) and numbers (c,) of residuals (n, 2) at places (n, 2), for :func:`mean_residuals_figure`."""
+    at = np.clip(xy_px / size_px * cells, 0, np.subtract(cells, 1)).astype(int) @ [cells[1], 1]
+    count = np.bincount(at, minlength=cells[0] * cells[1])
+    total = np.column_stack([np.bincount(at, each, len(count)) for each in residuals_px.T])
+    return total / np.maximum(count, 1)[:, None], count
+
+
 def mean_residuals_figure(
     mean_px: np.ndarray, count: np.ndarray, cells: tuple[int, int], size_px: tuple[int, int]
 ) -> Drawing:

@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.labels import dot_cells, parse_labels
 from stcal.report import svg
-from stcal.report.camera_figures import mean_residuals_figure
+from stcal.report.camera_figures import mean_residuals_figure, means_of_cells
 from stcal.report.svg import Axes, Drawing
 
 CELLS = (12, 8)  # number of cells of the image, in x and y, of which the mean residuals are drawn
@@ -39,11 +39,8 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
 
 def residual_field(residuals: np.ndarray, size_px: tuple[int, int]) -> Drawing:
     """Draws mean residuals over the image; ``residuals`` : (n, 4), centre and residual, px."""
-    at = np.clip(residuals[:, :2] / size_px * CELLS, 0, np.array(CELLS) - 1).astype(int)
-    cell, cells = at @ [CELLS[1], 1], CELLS[0] * CELLS[1]
-    count = np.bincount(cell, minlength=cells)
-    total = np.stack([np.bincount(cell, residuals[:, k], cells) for k in (2, 3)], axis=1)
-    return mean_residuals_figure(total / np.maximum(count, 1)[:, None], count, CELLS, size_px)
+    means = means_of_cells(residuals[:, :2], residuals[:, 2:4], CELLS, size_px)
+    return mean_residuals_figure(*means, CELLS, size_px)
 
 
 def by_photograph(rows: list[dict]) -> Drawing:
