@@ -300,7 +300,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
         (lambda: robot.Measurements.from_arrays(np.zeros((4, 6))), "E-MEASURED-KIND … positions"),
         (lambda: robot.Measurements.from_arrays(np.zeros((4, 6)), np.zeros((3, 3))), "E-ARRAY-SHAPE … positions"),
         (lambda: robot.Targets("t", (1,), ("",), Poses.of([Rigid()]), np.zeros((2, 6))), "E-ARRAY-SHAPE … (2, 6)"),
-        (lambda: handeye.HandEyePoses.from_matrices([], [], unit="km"), "E-OPTION-VALUE … 'km' … mm"),  # type: ignore
+        (lambda: handeye.HandEyePoses.from_matrices([], [], unit="km"), "E-OPTION-VALUE … 'km' … mm"),
         (lambda: files_of_arrays({}), "E-IMAGES-NONE … memory"),
         (lambda: files_of_arrays({"a/b": [np.zeros((4, 4), np.uint8)]}), "E-IMAGES-GROUP … 'a/b'"),
         (lambda: files_of_arrays({"..": [np.zeros((4, 4), np.uint8)]}), "E-IMAGES-GROUP … '..'"),

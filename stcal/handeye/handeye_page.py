@@ -226,7 +226,7 @@ def _coverage(outcome: Outcome) -> list[Block]:
     return [
         f"Corners were seen in {(count > 0).mean():.0%} of the cells of the image. Where they never were, nothing "
         "checks the distortion of the lens",
-        plots(plot(lambda: mean_residuals_figure(mean, count, CELLS, size), said, css="")),
+        plots(plot(lambda: mean_residuals_figure(mean, count, CELLS, size), "coverage of the image", said, "")),
     ]
 
 
